@@ -1,0 +1,49 @@
+# `make` or `make help` lists the targets; every target sets up what it needs by itself.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.DEFAULT_GOAL := help
+.PHONY: help setup figures paper smoke test lint bench clean
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: $(READY) ## install everything into .venv, at the exact versions of constraints.txt
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "bcrl needs Python 3.11 or newer; use make PYTHON=python3.11"; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+figures: $(READY) ## Figures 1, 2, 3 and 5 from runs of your own: 3 seeds a variant, minutes
+	$(BIN)/bcrl experiment=fig1 scale=quick
+	$(BIN)/bcrl experiment=fig2 scale=quick
+	$(BIN)/bcrl-report --scale quick
+
+paper: $(READY) ## the same at the paper's number of seeds
+	$(BIN)/bcrl experiment=fig1 scale=paper workers=2
+	$(BIN)/bcrl experiment=fig2 scale=paper workers=2
+	$(BIN)/bcrl-report --scale paper
+
+smoke: $(READY) ## every variant in seconds, then the report
+	$(BIN)/bcrl experiment=fig1 scale=smoke
+	$(BIN)/bcrl experiment=fig2 scale=smoke
+	$(BIN)/bcrl-report --scale smoke
+
+test: $(READY) ## the tests
+	$(BIN)/python -m pytest --numprocesses 2
+
+lint: $(READY) ## style and unused code
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+bench: $(READY) ## speed, as ratios against scikit-learn in one run
+	$(BIN)/python bench/forest.py
+
+clean: ## remove .venv and caches; results in runs/ stay
+	rm -rf $(VENV) .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,3 @@
+"""Boosted Curriculum Reinforcement Learning (Klink et al., ICLR 2022), reproduced."""
+
+__version__ = "0.1.0"

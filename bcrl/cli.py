@@ -1,0 +1,68 @@
+"""The `bcrl` command: vets what Hydra composes, then lets Hydra run it."""
+
+from __future__ import annotations
+
+import sys
+from argparse import Namespace
+
+import hydra
+from hydra._internal.utils import get_args_parser
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from bcrl import config, records, runner, vetting
+from bcrl.errors import BcrlError
+
+REFUSED = 2  # exit code
+
+
+def main() -> None:
+    """Console entry point; refuses bad input with one message before any work."""
+    config.register()
+    arguments = get_args_parser().parse_intermixed_args()
+    # Hydra wants the options before the overrides; people write them anywhere.
+    options = [a for a in sys.argv[1:] if a not in arguments.overrides]
+    sys.argv[1:] = options + arguments.overrides
+    try:
+        _vet(arguments)
+        _run_job()
+    except BcrlError as error:
+        sys.exit(_complain(error))
+    except KeyboardInterrupt:
+        print("bcrl: interrupted; complete seeds are kept", file=sys.stderr)
+        sys.exit(130)
+
+
+def _vet(arguments: Namespace) -> None:
+    if arguments.experimental_rerun:
+        raise BcrlError("--experimental-rerun: unpickles a file, which isn't supported")
+    if arguments.config_path:
+        raise BcrlError("--config-path: add a folder of your own with --config-dir")
+    if arguments.help or arguments.hydra_help or arguments.shell_completion:
+        # Hydra composes for these too, and env is a required choice.
+        if not any(o.startswith(("env=", "experiment=")) for o in arguments.overrides):
+            sys.argv += ["env=maze"] * (not arguments.shell_completion)
+        return
+    plans = vetting.plans(arguments)
+    if not arguments.cfg and not arguments.info:
+        for plan in plans:
+            records.check_directory(plan)
+        records.make_directory(plans[0].root)
+
+
+@hydra.main(
+    version_base="1.3", config_path=str(vetting.CONF), config_name=vetting.CONFIG_NAME
+)
+def _run_job(composed: DictConfig) -> None:
+    """One job of Hydra's: its composed config is planned and run."""
+    now = HydraConfig.get().runtime
+    folders = [source.path for source in now.config_sources if source.schema == "file"]
+    try:
+        runner.run(vetting.plan(composed, now.choices, folders))
+    except BcrlError as error:
+        sys.exit(_complain(error))
+
+
+def _complain(error: BcrlError) -> int:
+    print(f"bcrl: {error}", file=sys.stderr)
+    return REFUSED

@@ -1,0 +1,23 @@
+"""The tasks: one file per environment, each a frozen dataclass named `ENV`."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+
+from bcrl.envs.base import Env, FiniteEnv, is_finite
+from bcrl.errors import BcrlError, did_you_mean
+
+__all__ = ["Env", "FiniteEnv", "env_class", "env_names", "is_finite"]
+
+
+def env_names() -> list[str]:
+    """Names of the environments that this package ships."""
+    return [m.name for m in pkgutil.iter_modules(__path__) if m.name != "base"]
+
+
+def env_class(name: str) -> type:
+    """The environment class called `name`; BcrlError if there is none."""
+    if name not in env_names():
+        raise BcrlError(f"env.name={name}: {did_you_mean(name, env_names())}")
+    return importlib.import_module(f"bcrl.envs.{name}").ENV

@@ -1,0 +1,57 @@
+"""The environment protocol: pure functions on arrays, no state or randomness inside."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Step = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]
+
+
+class Env(Protocol):
+    """One task, as a frozen dataclass whose fields are its constants.
+
+    Arrays may have any leading axes (seeds, episodes); `d` is `state_dim`, `A` is
+    `n_actions`. Noise is drawn by the caller, uniform on [0, 1).
+    """
+
+    name: ClassVar[str]
+    n_actions: ClassVar[int]
+    state_dim: ClassVar[int]
+    initial_noise: ClassVar[int]  # uniforms that `initial` takes a state
+    step_noise: ClassVar[int]  # uniforms that `step` takes a state
+    gamma: float  # discount factor
+    horizon: int  # steps after which an episode is cut (not absorbing)
+
+    def initial(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Start states (..., d) from noise (..., initial_noise)."""
+
+    def step(
+        self,
+        state: NDArray[np.float64],
+        action: NDArray[np.integer],
+        noise: NDArray[np.float64] | None = None,
+    ) -> Step:
+        """Next state (..., d), reward (...) and whether it is absorbing (...)."""
+
+    def evaluation_states(self) -> NDArray[np.float64]:
+        """States (n, d) from which the greedy policy is evaluated."""
+
+
+class FiniteEnv(Env, Protocol):
+    """An environment that lists its states, so that its Q is a table, shape (N, A)."""
+
+    finite: bool  # whether the dynamics stay on the listed states
+
+    def states(self) -> NDArray[np.float64]:
+        """All states, shape (N, d)."""
+
+    def index(self, state: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Row of each state (..., d) in `states()`."""
+
+
+def is_finite(env: Env) -> bool:
+    """Whether `env` is a FiniteEnv whose Q can be tabulated."""
+    return getattr(env, "finite", False)

@@ -1,0 +1,241 @@
+"""The under-powered car that must rock its way up a hill (paper, §6.1 and C.1)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from bcrl.envs.base import Step
+from bcrl.errors import ConfigError
+
+FORCE = 4.0  # N, to the left (action 0) or to the right (action 1)
+GRAVITY = 9.81  # m/s²
+STEP_TIME = 0.1  # s that a force is held
+SUBSTEPS = 6  # Runge-Kutta steps a force is held for; error below 1e-7
+MAX_POSITION = 1.0  # m
+MAX_SPEED = 3.0  # m/s
+GRID = 10  # evaluation states along each axis
+START = (-0.5, 0.0)  # m, m/s: at rest in the valley
+
+
+@dataclass(frozen=True)
+class CarOnHill:
+    """Drive a car over the hill's right end without overspeeding or rolling off left.
+
+    | | |
+    |---|---|
+    | observation | p in [−1, 1] m (horizontal position), v in [−3, 3] m/s (its rate) |
+    | actions | 0: force u = −4 N, 1: u = +4 N, held for 0.1 s |
+    | hill | h'(p) = 2p + 1 if p < 0, else (1 + 5p²)^(−3/2) |
+    | | h''(p) = 2 if p < 0, else −15p (1 + 5p²)^(−5/2): a jump at p = 0 |
+    | dynamics | dp/dt = v; dv/dt = (u − g m h' − v² m h' h'') / (m (1 + h'²)) |
+    | reward | +1 if p > 1 and \\|v\\| ≤ 3; −1 if p < −1 or \\|v\\| > 3; else 0 |
+    | absorbing | whenever the reward is not 0; judged at the end of the 0.1 s |
+    | start | (−0.5, 0); episodes are cut after 100 steps |
+    | source | Ernst, Geurts & Wehenkel (2005); Klink et al. (2022), C.1 |
+
+    `mass` m [kg] is the task parameter, `gamma` the discount a step, `horizon` counts
+    steps. A state outside the bounds is a place one has left: it stays, with reward 0.
+    Raises ConfigError for mass ≤ 0, γ outside [0, 1) or a horizon below 1.
+    """
+
+    mass: float = 1.0
+    gamma: float = 0.95
+    horizon: int = 100
+
+    name: ClassVar[str] = "car_on_hill"
+    n_actions: ClassVar[int] = 2
+    state_dim: ClassVar[int] = 2
+    initial_noise: ClassVar[int] = 0
+    step_noise: ClassVar[int] = 0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.mass < math.inf:
+            raise ConfigError("env.mass", self.mass, "must be positive and finite (kg)")
+        if not 0.0 <= self.gamma < 1.0:
+            raise ConfigError("env.gamma", self.gamma, "must lie in [0, 1)")
+        if self.horizon < 1:
+            raise ConfigError("env.horizon", self.horizon, "must be at least 1 step")
+
+    def initial(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The valley (−0.5, 0) for noise of shape (..., 0)."""
+        return np.broadcast_to(np.array(START), (*noise.shape[:-1], 2)).copy()
+
+    def step(
+        self,
+        state: NDArray[np.float64],
+        action: NDArray[np.integer],
+        noise: NDArray[np.float64] | None = None,
+    ) -> Step:
+        """Hold a force for 0.1 s; IndexError for an action other than 0 and 1."""
+        state = np.asarray(state, dtype=np.float64)
+        action = np.asarray(action)
+        shape = state.shape[:-1]
+        if action.shape != shape:
+            shape = np.broadcast_shapes(shape, action.shape)
+            state = np.broadcast_to(state, (*shape, 2))
+            action = np.broadcast_to(action, shape)
+        flat = np.ascontiguousarray(state).reshape(-1, 2)
+        force = np.ascontiguousarray(action, dtype=np.int64).reshape(-1)
+        after, reward, absorbing = _steps(flat, force, self.mass)
+        return (
+            after.reshape(*shape, 2),
+            reward.reshape(shape),
+            absorbing.reshape(shape),
+        )
+
+    def evaluation_states(self) -> NDArray[np.float64]:
+        """A 10 × 10 grid over the bounds, position-major, shape (100, 2)."""
+        p = np.linspace(-MAX_POSITION, MAX_POSITION, GRID)
+        v = np.linspace(-MAX_SPEED, MAX_SPEED, GRID)
+        return np.stack(np.meshgrid(p, v, indexing="ij"), -1).reshape(-1, 2)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _acceleration(p: float, v: float, pull: float, left: bool) -> float:
+    """dv/dt [m/s²] on the left or right branch of the hill, both continued past 0."""
+    if left:
+        slope = 2.0 * p + 1.0
+        return (pull - slope * (GRAVITY + 2.0 * v * v)) / (1.0 + slope * slope)
+    # with q = 1 + 5p², both sides of the fraction are multiplied by q⁴: one root and one
+    # division remain, which are what this function's time goes into
+    q = 1.0 + 5.0 * p * p
+    q2 = q * q
+    force = pull * q2 * q2 - GRAVITY * q2 * math.sqrt(q) + 15.0 * p * v * v
+    return force / (q2 * q2 + q)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _runge_kutta(
+    p: float, v: float, dt: float, pull: float, left: bool
+) -> tuple[float, float]:
+    """(p, v) after `dt` seconds on one branch: the fifth-order Dormand–Prince step."""
+    a1 = _acceleration(p, v, pull, left)
+    v2 = v + dt * (a1 / 5)
+    p2 = p + dt * (v / 5)
+    a2 = _acceleration(p2, v2, pull, left)
+    v3 = v + dt * (a1 * (3 / 40) + a2 * (9 / 40))
+    p3 = p + dt * (v * (3 / 40) + v2 * (9 / 40))
+    a3 = _acceleration(p3, v3, pull, left)
+    v4 = v + dt * (a1 * (44 / 45) - a2 * (56 / 15) + a3 * (32 / 9))
+    p4 = p + dt * (v * (44 / 45) - v2 * (56 / 15) + v3 * (32 / 9))
+    a4 = _acceleration(p4, v4, pull, left)
+    b1, b2, b3, b4 = 19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729
+    v5 = v + dt * (a1 * b1 + a2 * b2 + a3 * b3 + a4 * b4)
+    p5 = p + dt * (v * b1 + v2 * b2 + v3 * b3 + v4 * b4)
+    a5 = _acceleration(p5, v5, pull, left)
+    b1, b2, b3, b4, b5 = 9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656
+    v6 = v + dt * (a1 * b1 + a2 * b2 + a3 * b3 + a4 * b4 + a5 * b5)
+    p6 = p + dt * (v * b1 + v2 * b2 + v3 * b3 + v4 * b4 + v5 * b5)
+    a6 = _acceleration(p6, v6, pull, left)
+    b1, b3, b4, b5, b6 = 35 / 384, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84
+    p += dt * (v * b1 + v3 * b3 + v4 * b4 + v5 * b5 + v6 * b6)
+    v += dt * (a1 * b1 + a3 * b3 + a4 * b4 + a5 * b5 + a6 * b6)
+    return p, v
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _exit_time(p: float, v: float, a: float, left: bool) -> float:
+    """Seconds until p leaves its branch through 0 at constant acceleration, or inf."""
+    if left:
+        p, v, a = -p, -v, -a
+    square = v * v - 2.0 * a * p
+    if square < 0.0 or (v >= 0.0 and a >= 0.0):
+        return math.inf
+    if v > 0.0:
+        return (v + math.sqrt(square)) / -a
+    bottom = math.sqrt(square) - v
+    return 2.0 * p / bottom if bottom > 0.0 else 0.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _cross(
+    p: float, v: float, dt: float, pull: float, left: bool
+) -> tuple[float, float, float]:
+    """(p, v, seconds used) at p = 0, or after `dt` if the branch is not left.
+
+    The parabola's exit time is corrected by Newton steps for as long as they land
+    nearer to 0: where the car barely turns at 0 they need not, and need not be exact,
+    since the branches differ by v² there.
+    """
+    t = _exit_time(p, v, _acceleration(p, v, pull, left), left)
+    t = max(0.0, min(t, dt))
+    best_p, best_v = _runge_kutta(p, v, t, pull, left)
+    best_t = t
+    for _ in range(5):
+        if best_v == 0.0 or best_p == 0.0:
+            break
+        t = max(0.0, min(best_t - best_p / best_v, dt))
+        new_p, new_v = _runge_kutta(p, v, t, pull, left)
+        if abs(new_p) >= abs(best_p):
+            break
+        best_p, best_v, best_t = new_p, new_v, t
+    return best_p, best_v, best_t
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def advance(p: float, v: float, pull: float) -> tuple[float, float]:
+    """(p, v) after 0.1 s under `pull` = u / m [m/s²], whatever the bounds.
+
+    A fixed step over the jump of h'' at p = 0 would be off by its length, so every step
+    that crosses is cut there and continued on the other branch.
+    """
+    if p == 0.0:
+        direction = v if v != 0.0 else _acceleration(p, v, pull, False)
+        left = direction < 0.0
+    else:
+        left = p < 0.0
+    for _ in range(SUBSTEPS):
+        rest = STEP_TIME / SUBSTEPS
+        for _ in range(4):  # crossings in one substep; two (in and out) can happen
+            new_p, new_v = _runge_kutta(p, v, rest, pull, left)
+            crosses = new_p > 0.0 if left else new_p < 0.0
+            if not crosses and (v < 0.0) != (new_v < 0.0):  # turned: before 0?
+                a = _acceleration(p, v, pull, left)
+                crosses = _exit_time(p, v, a, left) < rest
+            if not crosses:
+                break
+            p, v, used = _cross(p, v, rest, pull, left)
+            left = not left
+            rest -= used
+            new_p, new_v = p, v
+            if rest <= 0.0:
+                break
+        p, v = new_p, new_v
+    return p, v
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def outcome(p: float, v: float) -> float:
+    """Reward on arriving at (p, v): +1 at the goal, −1 if lost (NaN too), else 0."""
+    if not (p >= -MAX_POSITION and abs(v) <= MAX_SPEED):
+        return -1.0
+    return 1.0 if p > MAX_POSITION else 0.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _steps(
+    state: NDArray[np.float64], action: NDArray[np.int64], mass: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """`CarOnHill.step` on states (n, 2) and actions (n,), each lane by itself."""
+    after = np.empty_like(state)
+    reward = np.zeros(len(state))
+    absorbing = np.ones(len(state), dtype=np.bool_)
+    for i in range(len(state)):
+        p, v = state[i]
+        if action[i] != 0 and action[i] != 1:
+            raise IndexError("car_on_hill has the actions 0 (left) and 1 (right)")
+        if outcome(p, v) == 0.0:
+            p, v = advance(p, v, (FORCE if action[i] == 1 else -FORCE) / mass)
+            reward[i] = outcome(p, v)
+            absorbing[i] = reward[i] != 0.0
+        after[i, 0], after[i, 1] = p, v
+    return after, reward, absorbing
+
+
+ENV = CarOnHill

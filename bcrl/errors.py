@@ -1,0 +1,26 @@
+"""Errors that a user can mend: one clear message, no traceback."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class BcrlError(Exception):
+    """Something the user can put right; the message says what and how."""
+
+
+class ConfigError(BcrlError):
+    """A refused configuration value: names the key, the value and what is allowed."""
+
+    def __init__(self, key: str, value: object, allowed: str) -> None:
+        super().__init__(f"{key}={value}: {allowed}")
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """`did you mean maze?`, with the known words listed as long as they are few."""
+    known = sorted(known)
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    guess = f"did you mean {close[0]}?" if close else ""
+    listed = f"known: {', '.join(known)}" if len(known) <= 12 or not close else ""
+    return f"{guess} ({listed})" if guess and listed else guess or listed

@@ -1,0 +1,152 @@
+"""Metrics: what is measured after each iteration, in the task being trained."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bcrl import oracle
+from bcrl.envs import Env
+from bcrl.errors import ConfigError, did_you_mean
+from bcrl.learners.fqi import Snapshot
+from bcrl.rollout import Episodes, draws, rollout
+from bcrl.streams import stream
+
+
+@dataclass(frozen=True)
+class View:
+    """One seed's snapshot, as the metrics see it."""
+
+    q: NDArray[np.float64]  # (n_probe, A) at the probed states
+    residual: NDArray[np.float64]  # (n_probe, A)
+    returns: NDArray[np.float64]  # (E,) discounted returns of the greedy episodes
+    solved: NDArray[np.bool_]  # (E,)
+    start: NDArray[np.intp]  # (E,) where the episodes' starts are among the probed
+    reference: NDArray[np.intp]  # (n,) where the states with a known Q* are
+    q_star: NDArray[np.float64]  # (n, A) Q* of the task there
+    optimum: float | None  # V*(s0) of the *target* task, mean over starts
+
+
+def _return(view: View) -> float:
+    return view.returns.mean()
+
+
+def _q_error(view: View) -> float:
+    return abs(view.q[view.reference] - view.q_star).mean()
+
+
+def _q_error_start(view: View) -> float:
+    return abs(view.q[view.start] - view.optimum).mean()
+
+
+def _residual_start(view: View) -> float:
+    return view.residual[view.start].mean()
+
+
+def _solved(view: View) -> float:
+    return view.solved.mean()
+
+
+#: name in the CSV → its definition (docs/metrics.md says the same in words)
+METRICS: dict[str, Callable[[View], float]] = {
+    "return": _return,
+    "q_error": _q_error,
+    "q_error_start": _q_error_start,
+    "residual_start": _residual_start,
+    "solved": _solved,
+}
+
+
+def check(metrics: Sequence[str], target: Env) -> None:
+    """Raise ConfigError for a metric that is unknown or that `target` can't have."""
+    for name in metrics:
+        if name not in METRICS:
+            raise ConfigError("env.metrics", name, did_you_mean(str(name), METRICS))
+        if name.startswith("q_error") and not oracle.available(target):
+            raise ConfigError("env.metrics", name, f"no Q* of {target.name} is known")
+    if "q_error_start" in metrics and len(target.evaluation_states()) != 1:
+        why = f"{target.name} is not evaluated from one start state"
+        raise ConfigError("env.metrics", "q_error_start", why)
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Measures snapshots of several seeds; draws from the evaluation streams only."""
+
+    seeds: Sequence[int]
+    target: Env
+    metrics: Sequence[str]
+
+    @cached_property
+    def states(self) -> NDArray[np.float64]:
+        """The probed states (n_probe, d)."""
+        return probed_states(self.target)
+
+    @cached_property
+    def optimum(self) -> float | None:
+        """V*(s0) of the target, if the oracle knows the only evaluation state."""
+        known, start = oracle.reference(self.target), self.target.evaluation_states()
+        if known is None or len(start) != 1:
+            return None
+        at = np.flatnonzero((known.states == start).all(-1))
+        return float(known.q[at[0]].max()) if len(at) else None
+
+    def measure(self, snapshot: Snapshot) -> tuple[list[dict[str, float]], Episodes]:
+        """Each seed's metrics, and the greedy episodes behind them."""
+        env = snapshot.stage.env
+        start = env.evaluation_states()
+        u = np.stack(
+            [
+                draws(stream(seed, "evaluation", snapshot.iteration), env, len(start))
+                for seed in self.seeds
+            ]
+        )
+        everyone = np.broadcast_to(start, (len(self.seeds), *start.shape))
+        episodes = rollout(env, snapshot.q, everyone, u)
+        returns, solved = episodes.discounted_return(env.gamma), episodes.solved()
+        start_rows, rows, q_star = _layout(env, self.target)
+        views = (
+            View(
+                snapshot.probed_q[s],
+                snapshot.probed_residual[s],
+                returns[s],
+                solved[s],
+                start_rows,
+                rows,
+                q_star,
+                self.optimum,
+            )
+            for s in range(len(self.seeds))
+        )
+        return [
+            {m: float(METRICS[m](v)) for m in self.metrics} for v in views
+        ], episodes
+
+
+@lru_cache(maxsize=64)
+def probed_states(target: Env) -> NDArray[np.float64]:
+    """All states of an env that lists them, else those the metrics need, (n, d)."""
+    if hasattr(target, "states"):
+        return target.states()
+    known = oracle.reference(target)
+    asked = [target.evaluation_states()] + ([known.states] if known else [])
+    return np.unique(np.concatenate(asked), axis=0)
+
+
+@lru_cache(maxsize=64)
+def _layout(env: Env, target: Env) -> tuple[NDArray, NDArray, NDArray]:
+    """Rows of the start states and of Q*'s states among the probed ones, and Q*."""
+    states = probed_states(target)
+
+    def rows(of: NDArray) -> NDArray[np.intp]:
+        return (of[:, None] == states[None]).all(-1).argmax(1)
+
+    known = oracle.reference(env)
+    start = rows(env.evaluation_states())
+    if known is None:
+        return start, np.empty(0, np.intp), np.empty((0, env.n_actions))
+    return start, rows(known.states), known.q

@@ -1,0 +1,68 @@
+"""How far a run is: a bar on a terminal, else a line a task."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from tqdm import tqdm
+
+
+@dataclass(frozen=True)
+class Tick:
+    """One iteration done by a group of seeds."""
+
+    seeds: tuple[int, ...]
+    task: int
+    iteration: int
+    last_of_stage: bool
+
+
+class Progress:
+    """Shows ticks of one run; `mode` is bar, lines, none or auto."""
+
+    def __init__(
+        self, name: str, seeds: Sequence[int], iterations: int, mode: str
+    ) -> None:
+        if mode == "auto":
+            mode = "bar" if sys.stderr.isatty() else "lines"
+        self.name, self.iterations, self.mode = name, iterations, mode
+        self.done, self.total = 0, len(seeds) * iterations
+        self.began = time.monotonic()
+        shape = "{desc} |{bar}| {percentage:3.0f}% {elapsed}, {remaining} to go"
+        self.bar = (
+            tqdm(total=self.total, desc=name, bar_format=shape, leave=True)
+            if mode == "bar"
+            else None
+        )
+
+    def tick(self, tick: Tick) -> None:
+        """Count one iteration of a group."""
+        self.done += len(tick.seeds)
+        where = (
+            f"{self.name} · T{tick.task} · iteration {tick.iteration}/{self.iterations}"
+            f" · {_named(tick.seeds)}"
+        )
+        if self.bar is not None:
+            self.bar.set_description_str(where, refresh=False)
+            self.bar.update(len(tick.seeds))
+        elif self.mode == "lines" and tick.last_of_stage:
+            spent = time.monotonic() - self.began
+            left = spent * (self.total - self.done) / self.done
+            share = self.done / self.total
+            line = f"{where} · {share:4.0%} · {spent:.0f} s, {left:.0f} s to go"
+            print(line, file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Leave the terminal tidy."""
+        if self.bar is not None:
+            self.bar.close()
+
+
+def _named(seeds: Sequence[int]) -> str:
+    first, last = seeds[0], seeds[-1]
+    if last - first + 1 == len(seeds) > 1:
+        return f"seeds {first}–{last}"
+    return f"seed{'s' * (len(seeds) > 1)} " + ", ".join(map(str, seeds))

@@ -1,0 +1,84 @@
+"""Action-value functions of several seeds at once, and sums of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Values = list[NDArray[np.float64]]
+
+
+class Q(Protocol):
+    """Q-functions of S seeds; seed s is asked at its own states."""
+
+    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        """Action values, S arrays (n_s, A), at S arrays of states (n_s, d)."""
+
+
+class Zero:
+    """Q = 0: what an unfitted approximator predicts."""
+
+    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        return [np.zeros((len(x), n_actions)) for x in states]
+
+
+ZERO = Zero()
+
+
+@dataclass(frozen=True)
+class Sum:
+    """The sum of Q-functions: a frozen base and the residuals learned on it."""
+
+    terms: tuple[Q, ...]
+
+    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        total, *rest = (term(states, n_actions) for term in self.terms)
+        for values in rest:
+            total = [a + b for a, b in zip(total, values, strict=True)]
+        return total
+
+
+def add(base: Q, residual: Q) -> Q:
+    """base + residual, flattened and without zeros."""
+    terms: list[Q] = []
+    for q in (base, residual):
+        terms += q.terms if isinstance(q, Sum) else [] if q is ZERO else [q]
+    return terms[0] if len(terms) == 1 else Sum(tuple(terms)) if terms else ZERO
+
+
+@dataclass(frozen=True)
+class Table:
+    """Tabulated Q of a finite environment: one array (N, A) a seed."""
+
+    values: Sequence[NDArray[np.float64]]
+    index: Callable[[NDArray[np.float64]], NDArray[np.intp]]
+
+    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        return [q[self.index(x)] for q, x in zip(self.values, states, strict=True)]
+
+
+@dataclass(frozen=True)
+class Fits:
+    """One fitted model per seed and action; an action never seen predicts 0 (None)."""
+
+    models: Sequence[Sequence[Any | None]]
+    predict: Callable[[list[Any], list[NDArray[np.float64]]], list[NDArray[np.float64]]]
+
+    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        cells = [
+            (s, a)
+            for s, row in enumerate(self.models)
+            for a, model in enumerate(row)
+            if model is not None and len(states[s])
+        ]
+        out = [np.zeros((len(x), n_actions)) for x in states]
+        found = self.predict(
+            [self.models[s][a] for s, a in cells], [states[s] for s, _ in cells]
+        )
+        for (s, a), values in zip(cells, found, strict=True):
+            out[s][:, a] = values
+        return out

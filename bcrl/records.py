@@ -1,0 +1,177 @@
+"""Results on disk: one directory a composition, in it a CSV, JSON and NPZ a seed."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from bcrl.compose import Plain, Plan, differences, identity
+from bcrl.errors import BcrlError
+
+SCHEMA = 1  # raised when a file's meaning changes
+LIBRARIES = ("boosted-curriculum-rl", "hydra-core", "numpy", "numba", "scikit-learn")
+
+
+def atomic(path: Path, write: Callable[[IO[bytes]], None]) -> None:
+    """Write a file so that it is either complete or absent, also after a crash."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise BcrlError(f"can't write {path}: {error.strerror or error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def check_directory(plan: Plan) -> None:
+    """Raise BcrlError if the directory can't be written or holds another config."""
+    directory = plan.directory
+    existing = next(p for p in (directory, *directory.absolute().parents) if p.exists())
+    if not existing.is_dir():
+        raise BcrlError(f"runs_dir: {existing} is a file; name another folder")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise BcrlError(f"runs_dir: no permission to write in {existing}")
+    present = directory / "config.yaml"
+    if not present.exists():
+        return
+    try:
+        before = yaml.safe_load(present.read_text())
+        changed = differences(before, plan.config)
+    except (yaml.YAMLError, AttributeError, OSError) as error:
+        raise BcrlError(f"{present} can't be read ({error}); move it away") from error
+    if changed:
+        lines = [f"  {k}: there {a!r}, here {b!r}" for k, (a, b) in changed.items()]
+        raise BcrlError(
+            f"{directory} holds runs of a different config:\n" + "\n".join(lines) + "\n"
+            "choose a tag of its own (tag=NAME), another runs_dir, or remove it"
+        )
+
+
+def make_directory(directory: Path) -> None:
+    """Make a folder and those above it; BcrlError if that can't be done."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BcrlError(
+            f"runs_dir: can't make {directory}: {error.strerror}"
+        ) from error
+
+
+def open_directory(plan: Plan) -> list[int]:
+    """Make the directory; the plan's seeds that are not complete yet."""
+    check_directory(plan)
+    directory = plan.directory
+    make_directory(directory)
+    text = yaml.safe_dump(identity(plan.config), sort_keys=False, allow_unicode=True)
+    atomic(directory / "config.yaml", lambda file: file.write(text.encode()))
+    return [seed for seed in plan.seeds if not is_complete(directory, seed)]
+
+
+def seed_path(directory: Path, seed: int, suffix: str) -> Path:
+    """`seed_0007.csv` and its companions."""
+    return directory / f"seed_{seed:04d}.{suffix}"
+
+
+def is_complete(directory: Path, seed: int) -> bool:
+    """Whether this seed's metadata, written last, says that all of it is there."""
+    try:
+        metadata = json.loads(seed_path(directory, seed, "json").read_text())
+        complete = metadata["status"] == "complete" and metadata["schema"] == SCHEMA
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    files = [seed_path(directory, seed, suffix) for suffix in ("csv", "npz")]
+    return complete and all(file.exists() for file in files)
+
+
+def write_seed(
+    plan: Plan,
+    seed: int,
+    rows: Sequence[Mapping[str, int | float]],
+    arrays: Mapping[str, NDArray],
+    facts: Plain,
+) -> None:
+    """One seed's CSV, NPZ and, last, JSON with `facts` and where it was computed."""
+    directory = plan.directory
+    lines = [",".join(rows[0])]
+    lines += [",".join(repr(value) for value in row.values()) for row in rows]
+    text = "\n".join(lines) + "\n"
+    config = plan.config
+    metadata = {
+        "schema": SCHEMA,
+        "status": "complete",
+        "seed": seed,
+        "scale": config["scale"]["name"],
+        "env": config["env"]["name"],
+        "variant": plan.variant,
+        "tag": plan.tag,
+        **facts,
+        **_provenance(),
+        "config": config,
+    }
+    atomic(
+        seed_path(directory, seed, "npz"), lambda file: np.savez(file, **dict(arrays))
+    )
+    atomic(seed_path(directory, seed, "csv"), lambda file: file.write(text.encode()))
+    dump = json.dumps(metadata, indent=1, ensure_ascii=False, allow_nan=False)
+    atomic(seed_path(directory, seed, "json"), lambda file: file.write(dump.encode()))
+
+
+@cache
+def _provenance() -> dict[str, Any]:
+    """Versions, git revision and machine."""
+    return {
+        "command": " ".join(sys.argv),
+        "versions": {
+            "python": platform.python_version(),
+            **{name: version(name) for name in LIBRARIES},
+        },
+        "git": {
+            "revision": _git("rev-parse", "HEAD"),
+            "dirty": _git("status", "--porcelain") not in ("", None),
+        },
+        "machine": {
+            "system": platform.platform(),
+            "processor": _processor(),
+            "cores": os.cpu_count(),
+        },
+    }
+
+
+def _git(*arguments: str) -> str | None:
+    """What git says of the checkout this package lies in; None if it is not in one."""
+    here = Path(__file__).resolve().parent
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(here), *arguments],
+            capture_output=True,
+            text=True,
+            timeout=10,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = (line.split(":", 1)[1].strip() for line in lines if "model name" in line)
+    return next(names, platform.processor())

@@ -1,0 +1,1 @@
+"""Tables and figures from `runs/`; imports none of the training code."""

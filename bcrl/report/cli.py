@@ -1,0 +1,105 @@
+"""`bcrl-report`: figures, aggregate and claims from the runs of one scale."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from bcrl import __version__
+from bcrl.errors import BcrlError
+from bcrl.report import style
+from bcrl.report.document import claims_report
+from bcrl.report.figures import figure_1, figure_2, figure_5
+from bcrl.report.files import write_text
+from bcrl.report.load import Runs, load_runs
+from bcrl.report.maze_figure import figure_3
+from bcrl.report.tables import aggregate
+
+#: figure → environment, experiment that makes its runs, method it cannot do without
+FIGURES: dict[str, tuple[str, str, str | None, Callable[..., Figure]]] = {
+    "1": ("car_on_hill", "fig1", None, figure_1),
+    "2": ("maze", "fig2", None, figure_2),
+    "3": ("maze", "fig2", None, figure_3),
+    "5": ("maze", "fig2", "BC-FQI", figure_5),
+}
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line; its help is the reference."""
+    result = argparse.ArgumentParser(
+        prog="bcrl-report",
+        description="Draw the paper's figures and judge its claims from finished runs.",
+    )
+    result.add_argument(
+        "--runs-dir", type=Path, default=Path("runs"), help="default: %(default)s"
+    )
+    result.add_argument(
+        "--scale", default="quick", help="smoke, quick or paper; default: %(default)s"
+    )
+    result.add_argument(
+        "--figures",
+        nargs="+",
+        default=["all"],
+        choices=["all", *FIGURES],
+        metavar="N",
+        help=f"which of {', '.join(FIGURES)}, or all; default: all",
+    )
+    result.add_argument(
+        "--tag",
+        help="use the variants X@TAG instead of the plain ones",
+    )
+    result.add_argument("--out", type=Path, help="default: figures in the runs' folder")
+    result.add_argument("--version", action="version", version=__version__)
+    return result
+
+
+def report(
+    runs: Runs, out: Path, figures: Sequence[str], tag: str | None
+) -> tuple[list[Path], list[str]]:
+    """Write everything asked for; the files and what had to be skipped, and why."""
+    suffix = f"{runs.scale}@{tag}" if tag else runs.scale
+    tagged = f"@{tag}" if tag else ""
+    files, skipped = [], []
+    for name in figures:
+        env, experiment, needed, draw = FIGURES[name]
+        methods = runs.methods(env, tag)
+        if not methods or (needed and needed not in methods):
+            lacking = f"{env}/{needed or '*'}{tagged}"
+            remedy = f"`bcrl experiment={experiment} scale={runs.scale}` makes them"
+            remedy = f"the tag {tag} must be made first" if tag else remedy
+            skipped.append(f"figure {name}: no runs of {lacking}: {remedy}")
+            continue
+        with style.sheet():
+            title = f"Klink et al. (2022), figure {name}, reproduced: {suffix}"
+            files += style.save(draw(runs, tag), out, f"figure_{name}_{suffix}", title)
+    table = aggregate(runs).to_csv(index=False, lineterminator="\n")
+    files.append(write_text(out / f"aggregate_{runs.scale}.csv", table))
+    files.append(write_text(out / f"claims_{suffix}.md", claims_report(runs, tag)))
+    return files, skipped
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; 0 if all went well, 2 with one message for what a user can mend."""
+    options = parser().parse_args(arguments)
+    chosen = FIGURES if "all" in options.figures else dict.fromkeys(options.figures)
+    try:
+        runs = load_runs(options.runs_dir, options.scale)
+        for note in runs.notes:
+            print(f"note: {note.text}", file=sys.stderr)
+        out = options.out or options.runs_dir / "figures"
+        files, skipped = report(runs, out, list(chosen), options.tag)
+    except BcrlError as error:
+        print(f"bcrl-report: {error}", file=sys.stderr)
+        return 2
+    for line in skipped:
+        print(f"skipped {line}", file=sys.stderr)
+    print("\n".join(map(str, files)))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

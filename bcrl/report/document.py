@@ -1,0 +1,86 @@
+"""The claims as a Markdown document, with the values behind them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+
+from bcrl.report.claims import car_claims, maze_claims
+from bcrl.report.load import Runs, Variant
+from bcrl.report.tables import final_table, markdown, stage_table
+from bcrl.report.verdicts import FEWEST_SEEDS
+
+HEADER = (
+    "claim",
+    "quantity",
+    "expected",
+    "estimate [95 % interval]",
+    "seeds",
+    "verdict",
+)
+SECTIONS = (
+    ("car_on_hill", "Car on the hill (§6.1, Fig. 1)", car_claims),
+    ("maze", "Maze (§6.2 and C.2, Figs. 2, 3, 5)", maze_claims),
+)
+
+PREAMBLE = f"""\
+Intervals are 95 %: percentile bootstrap over seeds for means and their differences,
+Wilson's and Newcombe's score intervals for shares of seeds. A claim *holds* if the
+whole interval agrees with the stated sign, *does not hold* if the whole interval
+contradicts it, and is *undecided* otherwise or with fewer than {FEWEST_SEEDS} seeds.
+Claims that something never happens are judged by the count. Each claim is judged
+by itself, without a correction for their number.
+"""
+
+
+def claims_report(runs: Runs, tag: str | None = None) -> str:
+    """The Markdown document: per environment the claims and the values behind them."""
+    tagged = f", variants @{tag}" if tag else ""
+    parts = [f"# The paper's claims, scale {runs.scale}{tagged}\n", PREAMBLE]
+    for env, title, claims in SECTIONS:
+        methods = runs.methods(env, tag)
+        parts.append(f"## {title}\n")
+        if not methods:
+            parts.append("No runs.\n")
+            continue
+        rows = [claim.row(methods) for claim in claims()]
+        parts.append(_tally([row[-1] for row in rows]))
+        parts.append(markdown(HEADER, rows))
+        parts.append("After the last iteration (IQM: interquartile mean over seeds):\n")
+        parts.append(final_table(methods))
+        parts.extend(_by_stage(methods))
+        parts.append(_cost(methods))
+    notes = [f"- {note.text}" for note in runs.notes if note.tag == tag]
+    if notes:
+        parts.append("## Notes on the runs\n")
+        parts.append("\n".join(notes) + "\n")
+    return "\n".join(parts)
+
+
+def _tally(verdicts: list[str]) -> str:
+    """How many claims got which verdict, reasons left aside."""
+    counts = Counter(verdict.split(" (")[0].split(":")[0] for verdict in verdicts)
+    counted = ", ".join(f"{n} {verdict}" for verdict, n in counts.most_common())
+    return f"{len(verdicts)} claims: {counted}.\n"
+
+
+def _by_stage(methods: Mapping[str, Variant]) -> list[str]:
+    """What each stage ended with, so that the course can be followed."""
+    parts = ["Mean error |Q − Q*| in the trained task at every stage's end:\n"]
+    parts.append(stage_table(methods, "q_error"))
+    if all("solved" in variant.metrics for variant in methods.values()):
+        parts.append("Share of seeds solving the trained task at every stage's end:\n")
+        parts.append(stage_table(methods, "solved"))
+        parts.append("Mean residual at s0, averaged over actions, at stage ends:\n")
+        parts.append(stage_table(methods, "residual_start"))
+    return parts
+
+
+def _cost(methods: Mapping[str, Variant]) -> str:
+    seconds = sum(
+        float(sidecar.get("cpu_seconds") or 0.0)
+        for variant in methods.values()
+        for sidecar in variant.sidecars
+    )
+    spent = f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
+    return f"CPU time of these runs: {spent}.\n"

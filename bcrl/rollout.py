@@ -1,0 +1,157 @@
+"""Episodes of many seeds in lockstep: collecting data and evaluating policies."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from bcrl.envs import Env, is_finite
+from bcrl.policies import greedy, uniform
+from bcrl.q import Q, Table
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """E episodes of each of S seeds, at most T steps long; from `length` on void."""
+
+    state: NDArray[np.float64]  # (S, E, T + 1, d)
+    action: NDArray[np.intp]  # (S, E, T)
+    reward: NDArray[np.float64]  # (S, E, T)
+    absorbing: NDArray[np.bool_]  # (S, E, T)
+    length: NDArray[np.intp]  # (S, E)
+
+    def discounted_return(self, gamma: float) -> NDArray[np.float64]:
+        """Σ_t γ^t r_t of each episode, shape (S, E)."""
+        steps = np.arange(self.reward.shape[-1])
+        return (self.reward * gamma**steps).sum(-1)
+
+    def solved(self) -> NDArray[np.bool_]:
+        """Whether each episode was absorbed without a punishment, shape (S, E)."""
+        last = np.maximum(self.length - 1, 0)[..., None]
+        ended = np.take_along_axis(self.absorbing, last, -1)[..., 0]
+        return ended & (np.take_along_axis(self.reward, last, -1)[..., 0] >= 0.0)
+
+
+def draws(rng: np.random.Generator, env: Env, episodes: int) -> NDArray[np.float64]:
+    """All uniforms of one seed's episodes, shape (T, E, 2 + step_noise).
+
+    Entry 0 decides whether to explore, entry 1 picks the random action or breaks ties,
+    the rest is the environment's noise. Every lane has its draws, used or not.
+    """
+    return rng.random((env.horizon, episodes, 2 + env.step_noise))
+
+
+def start_states(
+    rng: np.random.Generator, env: Env, episodes: int
+) -> NDArray[np.float64]:
+    """Start states of one seed's episodes, shape (E, d)."""
+    return env.initial(rng.random((episodes, env.initial_noise)))
+
+
+def rollout(
+    env: Env,
+    q: Q,
+    start: NDArray[np.float64],
+    u: NDArray[np.float64],
+    epsilon: float = 0.0,
+) -> Episodes:
+    """ε-greedy episodes from start (S, E, d) with uniforms u (S, T, E, 2 + noise)."""
+    if is_finite(env) and isinstance(q, Table):
+        return _tabular_rollout(env, q, start, u, epsilon)
+    n_seeds, n_episodes, d = start.shape
+    horizon = u.shape[1]
+    state = np.zeros((n_seeds, n_episodes, horizon + 1, d))
+    state[:, :, 0] = start
+    action = np.zeros((n_seeds, n_episodes, horizon), np.intp)
+    reward = np.zeros((n_seeds, n_episodes, horizon))
+    absorbing = np.zeros((n_seeds, n_episodes, horizon), bool)
+    length = np.zeros((n_seeds, n_episodes), np.intp)
+    alive = np.ones((n_seeds, n_episodes), bool)
+    for t in range(horizon):
+        now = state[:, :, t]
+        act = uniform(env.n_actions, u[:, t, :, 1])
+        exploit = alive & (u[:, t, :, 0] >= epsilon)
+        if exploit.any():
+            asked = [now[s, exploit[s]] for s in range(n_seeds)]
+            values = np.concatenate(q(asked, env.n_actions))
+            act[exploit] = greedy(values, u[:, t, :, 1][exploit])
+        length[alive] += 1
+        action[:, :, t] = act
+        after, r, done = env.step(now[alive], act[alive], u[:, t, :, 2:][alive])
+        state[:, :, t + 1] = now
+        state[alive, t + 1], reward[alive, t], absorbing[alive, t] = after, r, done
+        alive[alive] = ~done
+        if not alive.any():
+            break
+    return Episodes(state, action, reward, absorbing, length)
+
+
+@functools.lru_cache(maxsize=64)
+def transition_tables(
+    env: Env,
+) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.bool_]]:
+    """Next row, reward and absorption of a finite deterministic env, each (N, A)."""
+    states = env.states()
+    every = np.repeat(states[:, None], env.n_actions, axis=1)
+    actions = np.broadcast_to(np.arange(env.n_actions), every.shape[:2])
+    after, reward, absorbing = env.step(every, actions)
+    return env.index(after), reward, absorbing
+
+
+def _tabular_rollout(
+    env: Env, q: Table, start: NDArray, u: NDArray, epsilon: float
+) -> Episodes:
+    """`rollout` on a finite environment, walked row by row in compiled code."""
+    tables = transition_tables(env)
+    first = env.index(start)
+    walked = [
+        _walk(*tables, values, first[s], u[s], epsilon)
+        for s, values in enumerate(q.values)
+    ]
+    row, action, length = (np.stack(part) for part in zip(*walked, strict=True))
+    void = np.arange(u.shape[1]) >= length[..., None]
+    _, reward, absorbing = (table[row[..., :-1], action] for table in tables)
+    reward[void], absorbing[void] = 0.0, False
+    return Episodes(env.states()[row], action, reward, absorbing, length)
+
+
+@numba.njit(cache=True, nogil=True)
+def _walk(next_row, reward, absorbing, q, first, u, epsilon):
+    """Rows (E, T + 1), actions (E, T) and lengths (E,) of one seed's episodes."""
+    horizon, episodes = u.shape[0], u.shape[1]
+    n_actions = q.shape[1]
+    row = np.empty((episodes, horizon + 1), np.intp)
+    action = np.zeros((episodes, horizon), np.intp)
+    length = np.zeros(episodes, np.intp)
+    for e in range(episodes):
+        at = first[e]
+        row[e, 0] = at
+        for t in range(horizon):
+            if u[t, e, 0] < epsilon:
+                act = int(u[t, e, 1] * n_actions)
+            else:  # greedy, ties broken uniformly, as policies.greedy does
+                best, ties = q[at, 0], 1
+                for a in range(1, n_actions):
+                    if q[at, a] > best:
+                        best, ties = q[at, a], 1
+                    elif q[at, a] == best:
+                        ties += 1
+                rank = int(u[t, e, 1] * ties)
+                act = -1
+                while rank >= 0:
+                    act += 1
+                    if q[at, act] == best:
+                        rank -= 1
+            action[e, t] = act
+            length[e] = t + 1
+            done = absorbing[at, act]
+            at = next_row[at, act]
+            row[e, t + 1] = at
+            if done:
+                break
+        row[e, length[e] + 1 :] = at
+    return row, action, length

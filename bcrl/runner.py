@@ -1,0 +1,125 @@
+"""The one runner: a plan's seeds, trained in lockstep groups, become records."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import queue
+import resource
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+
+import numpy as np
+
+from bcrl import records
+from bcrl.compose import Plan
+from bcrl.learners.fqi import FQI
+from bcrl.probes import Probe
+from bcrl.progress import Progress, Tick
+
+Seeds = tuple[int, ...]
+
+
+def run(plan: Plan) -> None:
+    """Compute every seed of the plan that is not complete yet, and record it."""
+    pending = records.open_directory(plan)
+    name = f"{plan.config['env']['name']} {plan.name}"
+    skipped = len(plan.seeds) - len(pending)
+    if skipped and plan.config["progress"] != "none":
+        print(f"{name}: {skipped} of {len(plan.seeds)} seeds complete", file=sys.stderr)
+    if not pending:
+        return
+    progress = Progress(name, pending, plan.iterations, plan.config["progress"])
+    try:
+        _train(plan, _groups(plan, pending), progress.tick)
+    finally:
+        progress.close()
+
+
+def _groups(plan: Plan, seeds: list[int]) -> list[Seeds]:
+    """Seeds that train together: as many as allowed, but no worker left without."""
+    workers = plan.config["workers"]
+    size = min(plan.config["seeds"]["lockstep"], -(-len(seeds) // workers))
+    return [tuple(seeds[i : i + size]) for i in range(0, len(seeds), size)]
+
+
+def _train(plan: Plan, groups: list[Seeds], tick: Callable[[Tick], None]) -> None:
+    workers = min(plan.config["workers"], len(groups))
+    if workers == 1:
+        for group in groups:
+            train_group(plan, group, _threads(plan), tick)
+        return
+    context = multiprocessing.get_context("spawn")
+    with context.Manager() as manager:
+        ticks = manager.Queue()
+        with ProcessPoolExecutor(workers, context) as pool:
+            jobs = [
+                pool.submit(train_group, plan, group, _threads(plan), ticks.put)
+                for group in groups
+            ]
+            while not all(job.done() for job in jobs):
+                _drain(ticks, tick)
+            for job in as_completed(jobs):
+                job.result()
+            _drain(ticks, tick)
+
+
+def _drain(ticks: queue.Queue, tick: Callable[[Tick], None]) -> None:
+    """Hand on the workers' ticks until none has come for a moment."""
+    try:
+        while True:
+            tick(ticks.get(timeout=0.2))
+    except queue.Empty:
+        return
+
+
+def _threads(plan: Plan) -> int:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    return plan.config["threads"] or max(1, cores // plan.config["workers"])
+
+
+def train_group(
+    plan: Plan, seeds: Seeds, threads: int, tick: Callable[[Tick], None]
+) -> None:
+    """Train a group of seeds in lockstep and write each seed's files."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    learner = FQI(
+        seeds,
+        plan.regressor,
+        plan.transfer,
+        plan.shared_data,
+        plan.fixed_trees,
+        threads,
+    )
+    probe = Probe(seeds, plan.target, plan.metrics)
+    rows: list[list[dict]] = [[] for _ in seeds]
+    residuals: list[list[np.ndarray]] = [[] for _ in seeds]
+    for now in learner.run(plan.stages, probe.states):
+        measured, episodes = probe.measure(now)
+        where = {"stage": now.stage.number, "task": now.stage.task}
+        for s, metrics in enumerate(measured):
+            rows[s].append({**where, "iteration": now.iteration, **metrics})
+            if now.last_of_stage:
+                residuals[s].append(now.probed_residual[s])
+        tick(Tick(seeds, now.stage.task, now.iteration, now.last_of_stage))
+    facts = {
+        "optimum": probe.optimum,
+        "wall_seconds": time.perf_counter() - wall,
+        "cpu_seconds": (time.process_time() - cpu) / len(seeds),  # this seed's share
+        "lockstep": list(seeds),
+        "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
+    for s, seed in enumerate(seeds):
+        arrays = {
+            "states": probe.states,
+            "q": now.probed_q[s],
+            "residuals": np.stack(residuals[s]),
+        }
+        if episodes.length.shape[1] == 1:  # one evaluation episode: keep its path
+            arrays["trajectory"] = episodes.state[s, 0, : episodes.length[s, 0] + 1]
+        if hasattr(plan.target, "walls"):  # what a figure needs to draw the tasks
+            arrays["walls"] = np.stack([task.walls for task in plan.tasks])
+            arrays["goal"] = plan.target.goal
+        records.write_seed(plan, seed, rows[s], arrays, facts)

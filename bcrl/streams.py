@@ -1,0 +1,26 @@
+"""Random streams: one per seed and purpose, never a global generator."""
+
+from __future__ import annotations
+
+import numpy as np
+
+#: Purposes are numbered for good: a new one is appended, none is renumbered.
+PURPOSES = (
+    "data",
+    "exploration",
+    "replay",
+    "weights",
+    "trees",
+    "evaluation",
+    "shared_data",
+)
+
+
+def stream(seed: int, purpose: str, *path: int) -> np.random.Generator:
+    """A generator that depends on `(seed, purpose, *path)` alone.
+
+    `path` numbers what the stream is for (stage, iteration, action, …), so that a draw
+    never depends on how many draws came before it elsewhere, nor on other seeds.
+    """
+    key = (PURPOSES.index(purpose), *path)
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))

@@ -1,0 +1,177 @@
+"""Composes every job of a command line in advance, so that bad input stops it early."""
+
+from __future__ import annotations
+
+import re
+from argparse import Namespace
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException, MissingConfigException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from bcrl import compose
+from bcrl.compose import Plain, Plan
+from bcrl.errors import BcrlError, did_you_mean
+
+PACKAGE = Path(__file__).resolve().parent
+#: In a wheel the configs lie inside the package, in a checkout beside it.
+CONF = next(p for p in (PACKAGE / "conf", PACKAGE.parent / "conf") if p.is_dir())
+CONFIG_NAME = "config"
+#: The choices that make a variant; a run is compared with these at their defaults.
+VARIANT_GROUPS = ("env", "algorithm", "curriculum", "boosting", "transfer", "scale")
+Folders = tuple[str, ...]  # of configs, besides our own
+
+
+def plans(arguments: Namespace) -> list[Plan]:
+    """The checked plan of each job that this command line asks for."""
+    name = arguments.config_name or CONFIG_NAME
+    parsed = _parse(arguments.overrides)
+    folders: Folders = ()
+    if arguments.config_dir:
+        folder = Path(arguments.config_dir).absolute()
+        if not folder.is_dir():
+            raise BcrlError(f"--config-dir: there is no folder {folder}")
+        folders = (str(folder),)
+    searchpath = [o for o in parsed if o.key_or_group == "hydra.searchpath"]
+    parsed = [o for o in parsed if o not in searchpath]
+    for override in searchpath:
+        folders += tuple(str(p).removeprefix("file://") for p in override.value())
+    jobs = _jobs(name, parsed, bool(arguments.multirun), folders)
+    planned = []
+    for job in jobs:
+        composed = _compose(name, tuple(job), folders)
+        planned.append(plan(composed, composed.hydra.runtime.choices, folders))
+    _refuse_collisions(planned)
+    return planned
+
+
+def plan(
+    composed: DictConfig, choices: Mapping[str, str], folders: Sequence[str]
+) -> Plan:
+    """The plan of one composed config, made with these group choices."""
+    variant = tuple(f"{group}={choices[group]}" for group in VARIANT_GROUPS)
+    extra = tuple(f for f in folders if Path(f) != CONF)
+    return compose.plan(_plain(composed), _plain(_compose(CONFIG_NAME, variant, extra)))
+
+
+def _plain(composed: DictConfig) -> Plain:
+    job = OmegaConf.masked_copy(composed, [k for k in composed if k != "hydra"])
+    try:
+        return OmegaConf.to_container(job, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        raise BcrlError(_first_lines(error)) from error
+
+
+def _parse(overrides: Sequence[str]) -> list[Override]:
+    parser, parsed = OverridesParser.create(), []
+    for override in overrides:
+        try:
+            parsed += parser.parse_overrides([override])
+        except HydraException as error:
+            raise BcrlError(f"{override!r} can't be read as KEY=VALUE") from error
+    return parsed
+
+
+def _jobs(
+    name: str, overrides: list[Override], multirun: bool, folders: Folders
+) -> list[list[str]]:
+    """Each job's overrides: the product of what the command line and config sweep."""
+    fixed = [o.input_line for o in overrides if not o.is_sweep_override()]
+    firsts = [job[0] for job in zip(*_product(overrides)[:1], strict=True)]
+    first = _compose(name, tuple(firsts or fixed), folders).hydra
+    if not multirun and first.mode != RunMode.MULTIRUN:
+        swept = [o.key_or_group for o in overrides if o.is_sweep_override()]
+        if swept:
+            raise BcrlError(f"{swept[0]}: several values are a sweep; add -m")
+        return [fixed]
+    params = [f"{k}={v}" for k, v in (first.sweeper.get("params") or {}).items()]
+    return _product(_parse(params) + overrides)
+
+
+def _product(overrides: list[Override]) -> list[list[str]]:
+    try:
+        return BasicSweeper.split_arguments(overrides, None)[0]
+    except HydraException as error:
+        raise BcrlError(_first_lines(error)) from error
+
+
+def _refuse_collisions(planned: Sequence[Plan]) -> None:
+    """Raise BcrlError if two different configs of a sweep would share a directory."""
+    seen: dict[Path, Plan] = {}
+    for new in planned:
+        old = seen.setdefault(new.directory, new)
+        changed = compose.differences(old.config, new.config)
+        if changed:
+            key, (a, b) = next(iter(changed.items()))
+            why = f"both {key}={a} and {key}={b} would write to {new.directory}"
+            raise BcrlError(f"tag={new.tag}: {why}; drop the tag or vary it too")
+
+
+@cache
+def _compose(name: str, overrides: tuple[str, ...], folders: Folders) -> DictConfig:
+    """Hydra's composition of one job, its errors made short."""
+    extra = [f"file://{folder}" for folder in folders]
+    path = [f"hydra.searchpath=[{','.join(extra)}]"] if extra else []
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        try:
+            return hydra_compose(name, [*overrides, *path], return_hydra_config=True)
+        except MissingConfigException as error:
+            raise BcrlError(_missing(error)) from error
+        except (HydraException, OmegaConfBaseException) as error:
+            message = _first_lines(error)
+        except Exception as error:  # e.g. YAML's own; composing runs nothing of ours
+            hint = "; quote on and off, YAML takes them for booleans" * (
+                "in defaults : bool" in str(error)
+            )
+            text = f"the configs can't be read: {_first_lines(error)}{hint}"
+            raise BcrlError(text) from error
+        unknown = re.match(r"Could not override '([^']+)'", message)
+        if unknown:
+            message = f"{unknown[1]}: unknown key; " + _known_keys(
+                name, unknown[1], overrides, path
+            )
+        raise BcrlError(message)
+
+
+def _missing(error: MissingConfigException) -> str:
+    wanted = error.missing_cfg_file or ""
+    group, _, option = wanted.rpartition("/")
+    if not group or error.options is None:
+        return _first_lines(error)
+    return f"{group}={option}: {did_you_mean(option, error.options)}"
+
+
+def _known_keys(
+    name: str, key: str, overrides: Sequence[str], path: Sequence[str]
+) -> str:
+    """What `key` may have meant, among the keys of the same choice of groups."""
+    groups = [o for o in overrides if "." not in o.split("=")[0] and o[0] not in "+~"]
+    for asked in (groups, ["env=maze"]):
+        try:
+            composed = hydra_compose(name, [*asked, *path])
+        except (HydraException, OmegaConfBaseException):
+            continue
+        flat = compose.flat(OmegaConf.to_container(composed))
+        return did_you_mean(key, flat)
+    return "see bcrl --help"
+
+
+def _first_lines(error: BaseException) -> str:
+    """An error's own words, without the key and type listing that OmegaConf appends."""
+    lines = str(error).strip().splitlines()
+    listing = r"\s*(full_key|reference_type|object_type)"
+    text = " ".join(x.strip() for x in lines if not re.match(listing, x))
+    if error.__cause__ is not None and text.startswith("Error merging"):
+        return f"{text.split()[-1]}: {_first_lines(error.__cause__)}"
+    key = next((x.split(":", 1)[1].strip() for x in lines if "full_key" in x), "")
+    text = text or type(error).__name__
+    return text if not key or key in text else f"{key}: {text}"

@@ -1,0 +1,554 @@
+"""The report, on made-up runs whose right answers are known beforehand."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+from scipy import stats
+
+import bcrl.report
+from bcrl.report import cli, figures, files, style, verdicts
+from bcrl.report import statistics as st
+from bcrl.report.document import claims_report
+from bcrl.report.load import METHODS, METRICS, load_runs
+from bcrl.report.maze_figure import figure_3, seed_mean_value
+from bcrl.report.tables import aggregate
+
+LENGTHS = {
+    "car_on_hill": (20, 20, 20),
+    "maze": (10, 10, 10, 10, 20, 20, 50, 50, 50, 50),
+}
+SHORT = {"car_on_hill": (3, 3, 3), "maze": (2,) * 10}
+OPTIMUM = -47.557563488
+LATTICE = np.array([(x, y) for x in range(21) for y in range(21)]) / 20
+ROUTE = [(0, 0), (0, 19), (5, 19), (5, 1), (13, 1), (13, 19), (18, 19)]
+
+
+def made_up(env: str, method: str, seed: int, stage: np.ndarray) -> dict:
+    """Curves of about the shape that the paper shows."""
+    rng = np.random.default_rng([seed, METHODS.index(method)])
+    t = np.arange(len(stage)) / len(stage)
+    good = {"FQI": 0.25, "C-FQI": 0.5, "B-FQI": 0.3, "BC-FQI": 1.0}[method]
+    noise = rng.normal(0, 0.02, len(t)).cumsum() * (1.3 - good)
+    if env == "car_on_hill":
+        error = 0.45 - 0.25 * good * t + 0.1 * noise + 0.03 * (stage == 2)
+        return {"q_error": error, "return": 0.4 * good * t + 0.2 * noise}
+    solved = np.full(len(t), method == "BC-FQI")
+    if method == "C-FQI":
+        solved = rng.random(len(t)) > t
+    reached = -30 - 17.557563488 * t
+    residual = rng.normal(-12, 1, len(t)) / stage - 4 * (stage == 7)
+    error = 30 * (1 - good * t) + 5 * noise + rng.normal(0, 1)
+    return {
+        "return": np.where(solved, reached, -85 + 10 * noise),
+        "q_error_start": abs(error),
+        "q_error": 0.8 * abs(error),
+        "residual_start": residual,
+        "solved": solved.astype(int),
+    }
+
+
+def route() -> np.ndarray:
+    """A path through the target maze, every lattice point on it, (L, 2)."""
+    points = [np.array(ROUTE[0])]
+    for corner in ROUTE[1:]:
+        while (points[-1] != corner).any():
+            points.append(points[-1] + np.sign(np.array(corner) - points[-1]))
+    return np.array(points) / 20
+
+
+def maze_arrays(method: str, seed: int) -> dict[str, np.ndarray]:
+    path = route() if method in ("BC-FQI", "C-FQI") else route()[: 60 + seed % 8]
+    h = np.linspace(0.05, 0.95, 10)
+    ones, zeros = np.ones(10), np.zeros(10)
+    low = np.stack([0.15 * ones, zeros, 0.25 * ones, h], -1)
+    high = np.stack([0.55 * ones, 1 - h, 0.65 * ones, ones], -1)
+    values = LATTICE.sum(1) * 20 - 60 + seed
+    return {
+        "states": LATTICE,
+        "q": values[:, None] - np.arange(4),
+        "residuals": np.zeros((10, 441, 4)),
+        "trajectory": path,
+        "walls": np.stack([low, high], 1),
+        "goal": np.array([0.95, 0.95]),
+    }
+
+
+def write_runs(
+    runs_dir: Path,
+    env: str,
+    scale: str = "smoke",
+    seeds: int = 6,
+    methods: tuple[str, ...] = METHODS,
+    lengths: dict = SHORT,
+    tag: str = "",
+    curves=made_up,
+) -> None:
+    """Complete runs as the runner leaves them."""
+    stage = np.repeat(np.arange(1, len(lengths[env]) + 1), lengths[env])
+    for method in methods:
+        folder = runs_dir / scale / env / (method + tag)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "config.yaml").write_text("env: made up\n")
+        for seed in range(seeds):
+            stem = folder / f"seed_{seed:04d}"
+            curriculum = method.startswith(("C-", "BC-"))
+            table = {
+                "stage": stage,
+                "task": stage if curriculum else np.full(len(stage), stage[-1]),
+                "iteration": np.arange(1, len(stage) + 1),
+                **curves(env, method, seed, stage),
+            }
+            pd.DataFrame(table).to_csv(f"{stem}.csv", index=False)
+            sidecar = {"schema": 1, "status": "complete", "seed": seed, "scale": scale}
+            sidecar |= {"env": env, "variant": method, "tag": tag[1:] or None}
+            sidecar |= {"optimum": OPTIMUM if env == "maze" else None}
+            sidecar |= {"cpu_seconds": 3.6, "wall_seconds": 4.0, "config": {}}
+            stem.with_suffix(".json").write_text(json.dumps(sidecar))
+            arrays = maze_arrays(method, seed) if env == "maze" else {}
+            np.savez(f"{stem}.npz", **arrays)
+
+
+@pytest.fixture
+def runs_dir(tmp_path: Path) -> Path:
+    for env in METRICS:
+        write_runs(tmp_path / "runs", env)
+    return tmp_path / "runs"
+
+
+def run(runs_dir: Path, *arguments: str) -> int:
+    return cli.main(["--runs-dir", str(runs_dir), "--scale", "smoke", *arguments])
+
+
+def verdicts_of(document: str, section: str) -> dict[str, str]:
+    """Claim → verdict, read back from the Markdown table of a section."""
+    part = document.split(f"## {section}")[1].split("After the last iteration")[0]
+    lines = [line.strip("| ") for line in part.splitlines() if line.startswith("| ")]
+    rows = [re.split(r" (?<!\\)\| ", line) for line in lines[1:]]
+    return {cells[0]: cells[-1] for cells in rows}
+
+
+# --- statistics
+
+
+def test_standard_error_is_the_papers():
+    values = np.array([[1.0, 4.0], [3.0, 4.0]])
+    assert st.mean(values).tolist() == [2.0, 4.0]
+    # deviation of 1, 3 with ddof = 0 is 1, over √2
+    assert st.standard_error(values) == pytest.approx([1 / np.sqrt(2), 0.0])
+
+
+def test_interquartile_mean():
+    assert st.interquartile_mean([100.0, 1.0, 2.0, 3.0, -50.0]) == 2.0
+    values = np.random.default_rng(1).normal(size=41)
+    assert st.interquartile_mean(values) == pytest.approx(stats.trim_mean(values, 0.25))
+
+
+def test_bootstrap_of_two_values_is_the_binomial():
+    """Means of resamples of 0, 1 are 0, ½, 1 with ¼, ½, ¼: both ends are reached."""
+    assert st.bootstrap([0.0, 1.0]) == (0.0, 1.0)
+    # 0 and 1 in equal numbers, n = 100: the binomial's 2.5 and 97.5 % points
+    low, high = st.bootstrap(np.repeat([0.0, 1.0], 50))
+    expected = stats.binom.ppf([0.025, 0.975], 100, 0.5) / 100
+    assert (low, high) == pytest.approx(expected, abs=0.0101)
+
+
+def test_bootstrap_agrees_with_scipys():
+    values = np.random.default_rng(0).exponential(size=30)
+    ours = st.bootstrap(values)
+    theirs = stats.bootstrap(
+        (values,), np.mean, method="percentile", rng=np.random.default_rng(5)
+    ).confidence_interval
+    assert ours == pytest.approx(tuple(theirs), abs=0.02)
+
+
+def test_bootstrap_difference():
+    same = np.full(5, 3.0)
+    assert st.bootstrap_difference(same + 2, same) == (2.0, 2.0)
+    # independent resampling: variances add, so the interval is √2 times as wide
+    values = np.random.default_rng(2).normal(size=50)
+    low, high = st.bootstrap_difference(values, values)
+    one = st.bootstrap(values)
+    assert low < 0 < high
+    assert (high - low) / (one.high - one.low) == pytest.approx(np.sqrt(2), rel=0.05)
+
+
+@pytest.mark.parametrize("values", [[1.0], [1.0, np.nan], []])
+def test_no_interval_without_data(values):
+    assert np.isnan(st.bootstrap(values)).all()
+
+
+def test_share_intervals():
+    # Wilson 0 of n: [0, z² / (n + z²)]
+    z2 = stats.norm.ppf(0.975) ** 2
+    assert st.share_interval(0, 40) == pytest.approx((0, z2 / (40 + z2)))
+    low, high = st.share_interval(31, 40)
+    exact = stats.binomtest(31, 40).proportion_ci(method="wilson")
+    assert (low, high) == pytest.approx((exact.low, exact.high))
+    # Newcombe (1998), table II, example (a): 56/70 − 48/80
+    interval = st.share_difference_interval(56, 70, 48, 80)
+    assert interval == pytest.approx((0.0524, 0.3339), abs=1e-4)
+
+
+# --- figures
+
+
+def test_everything_is_written_and_listed(runs_dir, capsys):
+    assert run(runs_dir) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    listed = {Path(line) for line in captured.out.splitlines()}
+    names = {f"figure_{n}_smoke.{k}" for n in "1235" for k in ("png", "pdf")}
+    names |= {"aggregate_smoke.csv", "claims_smoke.md"}
+    assert listed == {runs_dir / "figures" / name for name in names}
+    assert {p.name for p in (runs_dir / "figures").iterdir()} == names
+
+
+def test_two_reports_are_byte_identical(runs_dir, tmp_path):
+    for name in ("a", "b"):
+        assert run(runs_dir, "--out", str(tmp_path / name), "--figures", "3") == 0
+    written = sorted(p.name for p in (tmp_path / "a").iterdir())
+    assert len(written) == 4
+    for name in written:
+        first, second = ((tmp_path / d / name).read_bytes() for d in "ab")
+        assert first == second
+
+
+@pytest.mark.parametrize("draw", [figures.figure_2, figures.figure_5])
+def test_task_labels_do_not_overlap(tmp_path, draw):
+    """At the paper's stage lengths, where the first four bands are very narrow."""
+    write_runs(tmp_path, "maze", seeds=2, lengths=LENGTHS)
+    runs = load_runs(tmp_path, "smoke")
+    with style.sheet():
+        figure: Figure = draw(runs)
+        figure.draw_without_rendering()
+        for axes in figure.axes:
+            boxes = [text.get_window_extent() for text in axes.texts]
+            assert [t.get_text() for t in axes.texts] == [f"T{i}" for i in range(1, 11)]
+            for i, box in enumerate(boxes):
+                assert not any(box.overlaps(other) for other in boxes[:i])
+
+
+def test_curves_are_the_means_of_the_records(runs_dir):
+    """Figure 1's bold lines, recomputed from the CSVs."""
+    with style.sheet():
+        axes = figures.figure_1(load_runs(runs_dir, "smoke")).axes[0]
+    bold = {line.get_color(): line for line in axes.lines if line.get_linewidth() > 1}
+    folder = runs_dir / "smoke" / "car_on_hill" / "BC-FQI"
+    tables = [pd.read_csv(path) for path in folder.glob("*.csv")]
+    expected = sum(table["q_error"] for table in tables) / len(tables)
+    line = bold[style.colour("BC-FQI")]
+    assert line.get_xdata().tolist() == list(range(1, 10))
+    assert line.get_ydata() == pytest.approx(expected.to_numpy())
+
+
+def test_one_colour_per_prefix():
+    assert style.colour("BC-FQI") == style.colour("BC-DQN")
+    methods = ["DQN", "C-DQN", "B-DQN", "BC-DQN", "SC-DQN", "SBC-DQN", "RPL", "PPR"]
+    assert len({style.colour(name) for name in methods}) == len(methods)
+
+
+def test_values_are_of_the_seed_mean(runs_dir):
+    """max_a of the mean, not the mean of max_a, and x-major states seen as x, y."""
+    runs = load_runs(runs_dir, "smoke")
+    x, y, value = seed_mean_value(runs.methods("maze", None)["FQI"])
+    assert value.shape == (21, 21)
+    assert value[3, 20] == pytest.approx((x[3] + y[20]) * 20 - 60 + np.mean(range(6)))
+    for seed in range(6):  # every seed prefers another action, by as much
+        path = runs_dir / "smoke" / "maze" / "FQI" / f"seed_{seed:04d}.npz"
+        q = np.zeros((441, 4))
+        q[:, seed % 2] = 1.0
+        np.savez(path, **(maze_arrays("FQI", seed) | {"q": q}))
+    _, _, value = seed_mean_value(runs.methods("maze", None)["FQI"])
+    assert value == pytest.approx(0.5)
+
+
+def test_one_environment_alone(tmp_path, capsys):
+    write_runs(tmp_path, "car_on_hill")
+    assert run(tmp_path) == 0
+    captured = capsys.readouterr()
+    assert "figure_1_smoke.png" in captured.out
+    assert "figure_2" not in captured.out
+    assert captured.err.count("`bcrl experiment=fig2 scale=smoke`") == 3
+
+
+def test_tagged_variants_are_drawn_on_request(tmp_path, capsys):
+    write_runs(tmp_path, "maze", methods=("FQI", "BC-FQI"))
+    write_runs(tmp_path, "maze", methods=("BC-FQI",), tag="@released", seeds=3)
+    assert run(tmp_path, "--figures", "2", "--tag", "released") == 0
+    captured = capsys.readouterr()
+    assert "figure_2_smoke@released.png" in captured.out
+    table = pd.read_csv(tmp_path / "figures" / "aggregate_smoke.csv")
+    assert set(table["variant"]) == {"FQI", "BC-FQI", "BC-FQI@released"}
+
+
+# --- aggregate
+
+
+def test_aggregate_recomputed(runs_dir):
+    table = aggregate(load_runs(runs_dir, "smoke"))
+    columns = "scale env variant stage task iteration metric seeds mean standard_error"
+    assert list(table.columns) == columns.split()
+    row = table.query(
+        "env == 'maze' and variant == 'C-FQI' and iteration == 7 and metric == 'return'"
+    )
+    folder = runs_dir / "smoke" / "maze" / "C-FQI"
+    values = [pd.read_csv(p)["return"][6] for p in sorted(folder.glob("*.csv"))]
+    assert row["mean"].item() == pytest.approx(np.mean(values))
+    assert row["standard_error"].item() == pytest.approx(np.std(values) / np.sqrt(6))
+    assert row[["stage", "task", "seeds"]].to_numpy().tolist() == [[4, 4, 6]]
+
+
+# --- claims
+
+
+def as_the_paper_says(env, method, seed, stage):
+    """Runs in which every claim is true, with a little spread between seeds."""
+    jitter = 0.001 * seed
+    first = np.concatenate([[True], np.diff(stage) > 0])
+    ones = np.ones(len(stage))
+    if env == "car_on_hill":
+        error = {"FQI": 0.5, "C-FQI": 0.3, "B-FQI": 0.45, "BC-FQI": 0.1}[method] * ones
+        last = np.concatenate([first[1:], [True]])
+        if method == "C-FQI":
+            error = error + 0.1 * (stage > 1) + 0.05 * (last & (stage == 3))
+        if method == "BC-FQI":
+            error = error - 0.02 * (stage == 2) + 0.04 * (first & (stage == 3))
+        return {"q_error": error + jitter, "return": 1 - error + jitter}
+    solves = method == "BC-FQI" or (method == "C-FQI" and seed == 0)
+    residual = np.array([9, 7, 5, 4, 3, 2, 6, 4, 3, 1])[stage - 1]
+    reached = OPTIMUM if solves else -80 - 5 * seed
+    error = {"FQI": 30, "C-FQI": 10, "B-FQI": 25, "BC-FQI": 1}[method] + jitter
+    return {
+        "return": reached * ones,
+        "q_error_start": error * ones,
+        "q_error": error * ones,
+        "residual_start": -residual - jitter,
+        "solved": int(solves) * ones,
+    }
+
+
+def the_opposite(env, method, seed, stage):
+    """The same with BC-FQI's and FQI's runs exchanged, and C-FQI's and B-FQI's."""
+    other = dict(zip(METHODS, METHODS[::-1], strict=True))
+    curves = as_the_paper_says(env, other[method], seed, stage)
+    if env == "maze":
+        curves["residual_start"] = curves["residual_start"][::-1]
+    return curves
+
+
+def claims(tmp_path: Path, curves, seeds: int = 6) -> tuple[dict, dict]:
+    for env in METRICS:
+        write_runs(tmp_path, env, curves=curves, seeds=seeds)
+    document = claims_report(load_runs(tmp_path, "smoke"))
+    return verdicts_of(document, "Car"), verdicts_of(document, "Maze")
+
+
+def test_true_claims_hold(tmp_path):
+    car, maze = claims(tmp_path, as_the_paper_says)
+    assert len(car) == 12
+    assert len(maze) == 17
+    assert {**car, **maze} == dict.fromkeys([*car, *maze], "holds")
+
+
+def test_false_claims_do_not(tmp_path):
+    car, maze = claims(tmp_path, the_opposite)
+    for found in (car, maze):
+        assert found["BC-FQI ends with a smaller error than FQI"] == "does not hold"
+        assert found["BC-FQI ends with a larger return than FQI"] == "does not hold"
+    assert car["C-FQI's error rises on the target task"] == "does not hold"
+    assert maze["FQI never solves the target"] == "does not hold"
+    assert maze["BC-FQI's residual at s0 shrinks from T1 to T6"] == "does not hold"
+    optimal = "BC-FQI learns an optimal policy: most seeds are at the optimum"
+    assert maze[optimal] == "does not hold"
+
+
+def test_few_seeds_decide_nothing(tmp_path):
+    car, _ = claims(tmp_path, as_the_paper_says, seeds=2)
+    assert set(car.values()) == {"undecided (fewer than 5 seeds)"}
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expect", "verdict"),
+    [
+        (-2.0, -1.0, "< 0", "holds"),
+        (-2.0, -1.0, "> 0", "does not hold"),
+        (-1.0, 1.0, "< 0", "undecided"),
+        (-1.0, 0.0, "≤ 0", "holds"),
+        (0.0, 1.0, "< 0", "does not hold"),
+        (0.6, 0.9, "> ½", "holds"),
+        (0.4, 0.9, "> ½", "undecided"),
+    ],
+)
+def test_verdicts(low, high, expect, verdict):
+    measured = verdicts.Measured((low + high) / 2, st.Interval(low, high))
+    assert verdicts.judge(measured, expect, seeds=9) == verdict
+
+
+def test_claims_without_the_method_say_so(tmp_path):
+    write_runs(tmp_path, "car_on_hill", methods=("FQI", "BC-FQI"))
+    document = claims_report(load_runs(tmp_path, "smoke"))
+    found = verdicts_of(document, "Car")
+    assert found["C-FQI's error jumps from T1 to T2"] == "no runs of C-FQI"
+    assert found["BC-FQI ends with a smaller error than FQI"] == "holds"
+
+
+# --- diagnostics and malformed files
+
+
+def noted(runs_dir: Path) -> str:
+    return "\n".join(note.text for note in load_runs(runs_dir, "smoke").notes)
+
+
+def edit_csv(path: Path, edit) -> None:
+    edit(pd.read_csv(path)).to_csv(path, index=False)
+
+
+def test_incomplete_seeds_are_named(runs_dir, capsys):
+    folder = runs_dir / "smoke" / "car_on_hill" / "B-FQI"
+    (folder / "seed_0002.json").unlink()
+    sidecar = json.loads((folder / "seed_0004.json").read_text())
+    sidecar["status"] = "running"
+    (folder / "seed_0004.json").write_text(json.dumps(sidecar))
+    assert run(runs_dir, "--figures", "1") == 0
+    err = capsys.readouterr().err
+    assert "seed 2 is incomplete (no seed_0002.json)" in err
+    assert "seed 4 is incomplete (status running)" in err
+    assert "0–5: FQI, C-FQI and BC-FQI; 0–1, 3, 5: B-FQI" in err
+    runs = load_runs(runs_dir, "smoke")
+    footer = "\n".join(
+        figures.small_print(runs, runs.methods("car_on_hill", None), "", 7.0)
+    )
+    assert "B-FQI 4" in footer
+    assert "seed 2 incomplete" in footer.replace("\n", " ")
+
+
+def test_unequal_iterations_are_named(runs_dir):
+    folder = runs_dir / "smoke" / "car_on_hill" / "FQI"
+    edit_csv(folder / "seed_0001.csv", lambda table: table[:7])
+    err = noted(runs_dir)
+    assert "7: 1" in err
+    assert "(7: FQI; 9: C-FQI, B-FQI and BC-FQI)" in err
+    assert load_runs(runs_dir, "smoke").methods("car_on_hill", None)["FQI"].metrics[
+        "return"
+    ].shape == (6, 7)
+
+
+def test_missing_variant_and_odd_values_are_named(tmp_path):
+    write_runs(tmp_path, "car_on_hill", methods=METHODS[:3])
+    path = tmp_path / "smoke" / "car_on_hill" / "FQI" / "seed_0005.csv"
+    edit_csv(path, lambda table: table.assign(q_error=np.inf))
+    err = noted(tmp_path)
+    assert "no runs of BC-FQI" in err
+    assert "q_error has non-finite values in seed 5" in err
+    found = verdicts_of(claims_report(load_runs(tmp_path, "smoke")), "Car")
+    jumps = "C-FQI's error jumps from T1 to T2"
+    assert found[jumps] in ("holds", "does not hold", "undecided")
+    assert found["BC-FQI ends with a smaller error than FQI"] == "no runs of BC-FQI"
+    table = aggregate(load_runs(tmp_path, "smoke"))
+    rows = table.query("variant == 'FQI' and metric == 'q_error'")
+    assert rows["mean"].isna().all()
+
+
+def test_unexpected_headers_are_named(runs_dir):
+    folder = runs_dir / "smoke" / "car_on_hill" / "FQI"
+    edit_csv(folder / "seed_0000.csv", lambda table: table.assign(extra=1))
+    edit_csv(folder / "seed_0001.csv", lambda table: table.drop(columns="return"))
+    err = noted(runs_dir)
+    assert "seed_0000.csv: header is stage,task,iteration,q_error,return,extra" in err
+    assert "no return: left out" in err
+    variant = load_runs(runs_dir, "smoke").methods("car_on_hill", None)["FQI"]
+    assert variant.seeds == (0, 2, 3, 4, 5)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("seed_0003.csv", "", "is not a readable CSV"),
+        ("seed_0003.csv", "stage,task,iteration,return\n1,1,one,2\n", "not a number"),
+        ("seed_0003.csv", "stage,task,iteration\n1,1,2\n", "does not count"),
+        ("seed_0003.csv", "stage,task,iteration\n", "has no rows"),
+        ("seed_0003.json", '{"status": "compl', "is not readable JSON"),
+        ("seed_0003.json", '{"status": "complete", "seed": 4}', "belongs to seed 4"),
+        ("seed_0003.npz", "PK", "is not a readable NPZ"),
+        ("seed_0003.npz", None, "is missing"),
+        ("seed_0003.csv", None, "is missing"),
+    ],
+)
+def test_malformed_files_are_refused(runs_dir, capsys, name, content, message):
+    path = runs_dir / "smoke" / "maze" / "FQI" / name
+    path.unlink() if content is None else path.write_text(content)
+    assert run(runs_dir, "--figures", "3") == 2
+    err = capsys.readouterr().err
+    assert f"{path} {message}" in err or (str(path) in err and message in err)
+    assert "delete" in err
+    assert "rerun" in err
+    assert "Traceback" not in err
+
+
+def test_mixed_configurations_are_refused(runs_dir, capsys):
+    path = runs_dir / "smoke" / "maze" / "FQI" / "seed_0002.csv"
+    edit_csv(path, lambda table: table.assign(stage=1))
+    assert run(runs_dir) == 2
+    assert "mixes two configurations" in capsys.readouterr().err
+
+
+def test_pickled_arrays_are_refused(runs_dir, capsys):
+    path = runs_dir / "smoke" / "maze" / "FQI" / "seed_0002.npz"
+    arrays = maze_arrays("FQI", 2) | {"q": np.array([{}], dtype=object)}
+    np.savez(path, **arrays)
+    assert run(runs_dir, "--figures", "3") == 2
+    assert "is not a readable NPZ" in capsys.readouterr().err
+
+
+def test_no_runs_at_all(tmp_path, capsys):
+    assert run(tmp_path) == 2
+    err = capsys.readouterr().err
+    assert "no complete runs" in err
+    assert "`bcrl experiment=fig1 scale=smoke`" in err
+    write_runs(tmp_path, "car_on_hill", scale="quick", seeds=1)
+    assert run(tmp_path) == 2
+    assert "there are runs at scale quick" in capsys.readouterr().err
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = files.write_text(tmp_path / "table.csv", "old")
+
+    def half(handle):
+        handle.write(b"ne")
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        files.write_atomically(path, half)
+    assert [p.name for p in tmp_path.iterdir()] == ["table.csv"]
+    assert path.read_text() == "old"
+
+
+def test_out_that_is_a_file(runs_dir, tmp_path, capsys):
+    (tmp_path / "out").write_text("")
+    assert run(runs_dir, "--out", str(tmp_path / "out"), "--figures", "1") == 2
+    assert "cannot write" in capsys.readouterr().err
+
+
+def test_report_imports_no_training_code():
+    for path in Path(bcrl.report.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module.startswith("bcrl"):
+                allowed = node.module.startswith(("bcrl.report", "bcrl.errors"))
+                assert allowed or [n.name for n in node.names] == ["__version__"]
+
+
+def test_figure_3_with_fewer_methods(tmp_path):
+    write_runs(tmp_path, "maze", methods=("FQI", "BC-FQI"), seeds=2)
+    with style.sheet():
+        figure = figure_3(load_runs(tmp_path, "smoke"))
+    titles = [a.get_title() for a in figure.axes if a.get_title()]
+    assert titles[:4] == ["T1", "T4", "T7", "T10"]
+    assert titles[-1] == "BC-FQI: 2 of 2 arrive"
