@@ -7,11 +7,11 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import yaml
@@ -19,24 +19,10 @@ from numpy.typing import NDArray
 
 from bcrl.compose import Plain, Plan, differences, identity
 from bcrl.errors import BcrlError
+from bcrl.files import write_atomically, write_text
 
 SCHEMA = 1  # raised when a file's meaning changes
 LIBRARIES = ("boosted-curriculum-rl", "hydra-core", "numpy", "numba", "scikit-learn")
-
-
-def atomic(path: Path, write: Callable[[IO[bytes]], None]) -> None:
-    """Write a file so that it is either complete or absent, also after a crash."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise BcrlError(f"can't write {path}: {error.strerror or error}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def check_directory(plan: Plan) -> None:
@@ -79,7 +65,7 @@ def open_directory(plan: Plan) -> list[int]:
     directory = plan.directory
     make_directory(directory)
     text = yaml.safe_dump(identity(plan.config), sort_keys=False, allow_unicode=True)
-    atomic(directory / "config.yaml", lambda file: file.write(text.encode()))
+    write_text(directory / "config.yaml", text)
     return [seed for seed in plan.seeds if not is_complete(directory, seed)]
 
 
@@ -124,12 +110,12 @@ def write_seed(
         **_provenance(),
         "config": config,
     }
-    atomic(
+    write_atomically(
         seed_path(directory, seed, "npz"), lambda file: np.savez(file, **dict(arrays))
     )
-    atomic(seed_path(directory, seed, "csv"), lambda file: file.write(text.encode()))
+    write_text(seed_path(directory, seed, "csv"), text)
     dump = json.dumps(metadata, indent=1, ensure_ascii=False, allow_nan=False)
-    atomic(seed_path(directory, seed, "json"), lambda file: file.write(dump.encode()))
+    write_text(seed_path(directory, seed, "json"), dump)
 
 
 @cache

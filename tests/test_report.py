@@ -417,24 +417,29 @@ def test_incomplete_seeds_are_named(runs_dir, capsys):
     sidecar = json.loads((folder / "seed_0004.json").read_text())
     sidecar["status"] = "running"
     (folder / "seed_0004.json").write_text(json.dumps(sidecar))
+    (folder / "seed_0005.json").write_text('{"schema": 0, "status": "complete"}')
     assert run(runs_dir, "--figures", "1") == 0
     err = capsys.readouterr().err
     assert "seed 2 is incomplete (no seed_0002.json)" in err
     assert "seed 4 is incomplete (status running)" in err
-    assert "0–5: FQI, C-FQI and BC-FQI; 0–1, 3, 5: B-FQI" in err
+    assert "seed 5 is incomplete (schema 0, not 1)" in err
+    assert "0–5: FQI, C-FQI and BC-FQI; 0–1, 3: B-FQI" in err
     runs = load_runs(runs_dir, "smoke")
     footer = "\n".join(
         figures.small_print(runs, runs.methods("car_on_hill", None), "", 7.0)
     )
-    assert "B-FQI 4" in footer
+    assert "B-FQI 3" in footer
     assert "seed 2 incomplete" in footer.replace("\n", " ")
+    only = {"FQI": runs.methods("car_on_hill", None)["FQI"]}
+    alone = figures.small_print(runs, only, "", 7.0, compares=False)
+    assert "Note" not in "".join(alone)
 
 
 def test_unequal_iterations_are_named(runs_dir):
     folder = runs_dir / "smoke" / "car_on_hill" / "FQI"
     edit_csv(folder / "seed_0001.csv", lambda table: table[:7])
     err = noted(runs_dir)
-    assert "7: 1" in err
+    assert "7: seed 1" in err
     assert "(7: FQI; 9: C-FQI, B-FQI and BC-FQI)" in err
     assert load_runs(runs_dir, "smoke").methods("car_on_hill", None)["FQI"].metrics[
         "return"
@@ -476,7 +481,7 @@ def test_unexpected_headers_are_named(runs_dir):
         ("seed_0003.csv", "stage,task,iteration\n1,1,2\n", "does not count"),
         ("seed_0003.csv", "stage,task,iteration\n", "has no rows"),
         ("seed_0003.json", '{"status": "compl', "is not readable JSON"),
-        ("seed_0003.json", '{"status": "complete", "seed": 4}', "belongs to seed 4"),
+        ("seed_0003.json", '{"schema": 1, "seed": 4}', "belongs to seed 4"),
         ("seed_0003.npz", "PK", "is not a readable NPZ"),
         ("seed_0003.npz", None, "is missing"),
         ("seed_0003.csv", None, "is missing"),
@@ -541,7 +546,7 @@ def test_report_imports_no_training_code():
     for path in Path(bcrl.report.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and node.module.startswith("bcrl"):
-                allowed = node.module.startswith(("bcrl.report", "bcrl.errors"))
+                allowed = node.module.startswith(("bcrl.report", "bcrl.errors", "bcrl.files"))
                 assert allowed or [n.name for n in node.names] == ["__version__"]
 
 
@@ -551,4 +556,4 @@ def test_figure_3_with_fewer_methods(tmp_path):
         figure = figure_3(load_runs(tmp_path, "smoke"))
     titles = [a.get_title() for a in figure.axes if a.get_title()]
     assert titles[:4] == ["T1", "T4", "T7", "T10"]
-    assert titles[-1] == "BC-FQI: 2 of 2 arrive"
+    assert titles[-4:] == ["FQI: 0 of 2 arrive", *METHODS[1:3], "BC-FQI: 2 of 2 arrive"]

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 
 from bcrl import __version__
 from bcrl.errors import BcrlError
+from bcrl.files import write_text
 from bcrl.report import style
 from bcrl.report.document import claims_report
 from bcrl.report.figures import figure_1, figure_2, figure_5
-from bcrl.report.files import write_text
 from bcrl.report.load import Runs, load_runs
 from bcrl.report.maze_figure import figure_3
 from bcrl.report.tables import aggregate
@@ -70,7 +70,9 @@ def report(
         if not methods or (needed and needed not in methods):
             lacking = f"{env}/{needed or '*'}{tagged}"
             remedy = f"`bcrl experiment={experiment} scale={runs.scale}` makes them"
-            remedy = f"the tag {tag} must be made first" if tag else remedy
+            if tag:
+                example = f"`bcrl experiment={experiment}_released scale={runs.scale}`"
+                remedy = f"runs with tag={tag} make them, as {example} does"
             skipped.append(f"figure {name}: no runs of {lacking}: {remedy}")
             continue
         with style.sheet():

@@ -10,40 +10,44 @@ from matplotlib.figure import Figure
 
 from bcrl.report import style
 from bcrl.report.load import Runs, Variant
-from bcrl.report.notes import Note
 from bcrl.report.statistics import mean, standard_error
 
-FOOTER_WIDTH = 22  # characters of small print to an inch
+FOOTER_WIDTH = 20  # characters of small print to an inch
 
 ENV_TITLES = {"car_on_hill": "Car on the hill", "maze": "Maze"}
 
 
 def small_print(
-    runs: Runs, methods: Mapping[str, Variant], what: str, width: float
+    runs: Runs,
+    methods: Mapping[str, Variant],
+    what: str,
+    width: float,
+    compares: bool = True,
 ) -> list[str]:
-    """The footer: environment, scale, number of seeds, what is drawn, notes."""
+    """The footer: environment, scale, number of seeds, what is drawn, notes.
+
+    `width` of the figure in inches; `compares`: notes on differences between methods
+    belong to it.
+    """
     env, tag = next((v.env, v.tag) for v in methods.values())
     counts = {name: len(v.seeds) for name, v in methods.items()}
     if len(set(counts.values())) == 1:
         n = next(iter(counts.values()))
-        seeds = (
-            f"{n} seed{'s' * (n != 1)} per method" if len(counts) > 1 else f"{n} seeds"
-        )
+        seeds = f"{n} seed{'s' * (n != 1)}{' per method' * (len(counts) > 1)}"
     else:
         seeds = "seeds " + ", ".join(f"{name} {n}" for name, n in counts.items())
     tagged = f" · variants @{tag}" if tag else ""
     lines = [f"{ENV_TITLES[env]} · scale {runs.scale} · {seeds}{tagged} · {what}"]
-    remarks = [n.footer for n in runs.notes if _concerns(n, env, tag, methods)]
+    shown = {*methods, None} if compares else set(methods)
+    remarks = [
+        note.footer
+        for note in runs.notes
+        if note.footer and (note.env, note.tag) == (env, tag) and note.method in shown
+    ]
     if remarks:
         lines.append("Note: " + "; ".join(remarks))
     limit = int(width * FOOTER_WIDTH)
     return [part for line in lines for part in textwrap.wrap(line, limit)]
-
-
-def _concerns(
-    note: Note, env: str, tag: str | None, methods: Mapping[str, Variant]
-) -> bool:
-    return bool(note.footer) and (note.env, note.tag) == (env, tag)
 
 
 def optimum_of(methods: Mapping[str, Variant]) -> float | None:
@@ -141,5 +145,5 @@ def figure_5(runs: Runs, tag: str | None = None) -> Figure:
     _mean_bands(axes, methods, "residual_start")
     style.legend(figure, methods)
     what = "mean ± 2 standard errors over seeds"
-    style.footer(figure, small_print(runs, methods, what, width))
+    style.footer(figure, small_print(runs, methods, what, width, False))
     return figure

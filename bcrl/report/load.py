@@ -22,6 +22,8 @@ METRICS = {
     "maze": ("return", "q_error_start", "q_error", "residual_start", "solved"),
 }
 
+SCHEMA = 1  # of the records that this report reads
+
 #: The methods that the figures compare, in the order of the legends.
 METHODS = ("FQI", "C-FQI", "B-FQI", "BC-FQI")
 
@@ -88,7 +90,10 @@ def _complete_seeds(folder: Path, env: str, tag: str | None) -> Iterator[Note | 
         if not path.exists():
             status = f"no {path.name}"
         else:
-            status = f"status {read_sidecar(path, seed).get('status')}"
+            sidecar = read_sidecar(path, seed)
+            status = f"status {sidecar.get('status')}"
+            if sidecar.get("schema") != SCHEMA:
+                status = f"schema {sidecar.get('schema')}, not {SCHEMA}"
         if status == "status complete":
             yield seed
         else:
@@ -97,6 +102,7 @@ def _complete_seeds(folder: Path, env: str, tag: str | None) -> Iterator[Note | 
                 env,
                 tag,
                 footer=f"{folder.name}: seed {seed} incomplete, left out",
+                method=folder.name.partition("@")[0],
             )
 
 
@@ -117,7 +123,7 @@ def _load_variant(folder: Path, env: str, notes: list[Note]) -> Variant | None:
         if missing:
             text = f"{path}: header is {header}; no {listed(missing)}: left out"
             short = f"{folder.name}: seed {seed} lacks columns, left out"
-            notes.append(Note(text, env, tag, footer=short))
+            notes.append(Note(text, env, tag, short, method))
             continue
         if env in METRICS and tuple(table.columns) != wanted:
             text = f"{path}: header is {header}, expected {','.join(wanted)}"
@@ -140,10 +146,10 @@ def _assemble(
     """Stack the seeds' tables, cut to the iterations that all of them have."""
     lengths = {seed: len(table) for seed, table in tables.items()}
     if len(set(lengths.values())) > 1:
-        groups = compared({str(seed): n for seed, n in lengths.items()})
+        groups = compared({f"seed {seed}": n for seed, n in lengths.items()})
         text = f"{folder}: iterations differ between seeds ({groups}): cut to the least"
         short = f"{folder.name}: cut to {min(lengths.values())} common iterations"
-        notes.append(Note(text, env, tag, footer=short))
+        notes.append(Note(text, env, tag, short, method))
     rows = min(lengths.values())
     first, *others = tables
     reference = tables[first]
@@ -168,7 +174,7 @@ def _assemble(
         if bad:
             text = f"{folder}: {name} has non-finite values in seed {listed(bad)}"
             short = f"{folder.name}: non-finite {name}, gaps in its mean"
-            notes.append(Note(text, env, tag, footer=short))
+            notes.append(Note(text, env, tag, short, method))
             values[~np.isfinite(values)] = np.nan  # a gap, not a line to infinity
     return Variant(
         env=env,

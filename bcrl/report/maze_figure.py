@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bcrl.report import style
 from bcrl.report.figures import small_print
-from bcrl.report.load import Runs, Variant
+from bcrl.report.load import METHODS, Runs, Variant
 from bcrl.report.seedfiles import unreadable
 
 SIZE = (11.4, 4.2)  # inches
@@ -131,11 +131,13 @@ def _paths(
 def _grid(
     panel: SubFigure, methods: Mapping[str, Variant]
 ) -> Iterator[tuple[Axes, tuple[str, Variant]]]:
-    """2 × 2 axes with a method each; those left over are hidden."""
-    grid = panel.subplots(2, 2).flat
-    for axes in grid[len(methods) :]:
-        axes.set_axis_off()
-    yield from zip(grid, methods.items(), strict=False)
+    """2 × 2 axes, each method at its own place; absent ones are said to be."""
+    for axes, name in zip(panel.subplots(2, 2).flat, METHODS, strict=True):
+        if name in methods:
+            yield axes, (name, methods[name])
+        else:
+            frame(axes, name)
+            axes.text(0.5, 0.5, "no runs", ha="center", va="center", color="0.5")
 
 
 def figure_3(runs: Runs, tag: str | None = None) -> Figure:

@@ -14,13 +14,15 @@ if TYPE_CHECKING:
 class Note:
     """One diagnostic: `text` for the terminal, `footer` (if any) for the figures.
 
-    It concerns the figures of `env` that draw the variants tagged `tag`.
+    It concerns the figures of `env` that draw the variants tagged `tag`: those with
+    `method` in them, or those that compare methods if it is None.
     """
 
     text: str
     env: str
     tag: str | None
     footer: str = ""
+    method: str | None = None
 
 
 def listed(items: Iterable[object]) -> str:

@@ -12,10 +12,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from bcrl import __version__
-from bcrl.report.files import write_atomically
+from bcrl.files import write_atomically
 from bcrl.report.load import Variant
 
 #: One colour per way of transfer, in every figure and for FQI and DQN alike: Okabe and
@@ -87,6 +88,7 @@ def shade_tasks(axes: Axes, spans: Sequence[tuple[str, float, float]]) -> None:
     """Grey bands, one per task, named above the axes; narrow ones in two rows."""
     first, last = spans[0][1], spans[-1][2]
     axes.set_xlim(first, last)
+    axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True, steps=[1, 2, 5, 10]))
     row, previous_narrow = 0, False
     for number, (label, start, end) in enumerate(spans):
         axes.axvspan(start, end, color=BANDS[number % 2], linewidth=0, zorder=0)

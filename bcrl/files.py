@@ -22,6 +22,8 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(hidden, "wb") as handle:
             write(handle)
+            handle.flush()
+            os.fsync(handle.fileno())
         os.replace(hidden, path)
     except OSError as error:
         raise BcrlError(f"cannot write {path}: {error.strerror or error}") from error

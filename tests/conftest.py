@@ -1,0 +1,50 @@
+"""What several tests share."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from argparse import Namespace
+from pathlib import Path
+
+import pytest
+
+from bcrl import config, vetting
+from bcrl.compose import Plan
+
+config.register()
+
+
+def plans(*overrides: str, multirun: bool = False, config_dir: str | None = None):
+    """The plans that `bcrl *overrides` would run."""
+    arguments = Namespace(
+        overrides=list(overrides),
+        multirun=multirun,
+        config_dir=config_dir,
+        config_name=None,
+    )
+    return vetting.plans(arguments)
+
+
+def plan(*overrides: str) -> Plan:
+    """The one plan of `bcrl *overrides`."""
+    (only,) = plans(*overrides)
+    return only
+
+
+@pytest.fixture
+def bcrl(tmp_path: Path):
+    """Runs the `bcrl` command in an empty folder."""
+
+    def run(*arguments: str) -> subprocess.CompletedProcess:
+        program = "import sys; sys.argv[0] = 'bcrl'; from bcrl.cli import main; main()"
+        return subprocess.run(
+            [sys.executable, "-c", program, *arguments],
+            cwd=tmp_path,
+            env={**os.environ, "BCRL_CACHE": str(tmp_path.parent / "cache")},
+            capture_output=True,
+            text=True,
+        )
+
+    return run

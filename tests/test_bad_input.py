@@ -1,0 +1,125 @@
+"""Bad input ends in one clear message before any work, and leaves nothing behind."""
+
+import pytest
+
+from bcrl.errors import BcrlError
+from tests.conftest import plans
+
+MAZE = "env=maze"
+BAD = {
+    "unknown env": (["env=maz"], ["env=maz", "did you mean maze?"]),
+    "no env": ([], ["You must specify 'env'", "maze"]),
+    "unknown regressor": ([MAZE, "algorithm/regressor=forst"], ["mean forest?"]),
+    "unknown preset": ([MAZE, "env.preset=relesed"], ["mean released?"]),
+    "unknown metric": ([MAZE, "env.metrics=[retrun]"], ["retrun", "return"]),
+    "unknown group": ([MAZE, "boostign=on"], ["boostign", "boosting"]),
+    "unknown key": ([MAZE, "seeds.cuont=1"], ["seeds.cuont", "seeds.count"]),
+    "added key": (
+        [MAZE, "+env.hieght=0.5"],
+        ["env.hieght=0.5", "unknown key", "height"],
+    ),
+    "no seeds": ([MAZE, "seeds.count=0"], ["seeds.count=0", "at least 1"]),
+    "negative seed": ([MAZE, "seeds.first=-1"], ["seeds.first=-1", "at least 0"]),
+    "no workers": ([MAZE, "workers=0"], ["workers=0", "at least 1"]),
+    "no threads": ([MAZE, "threads=0"], ["threads=0", "at least 1"]),
+    "wrong type": ([MAZE, "seeds.count=many"], ["seeds.count=many", "Integer"]),
+    "fractional": ([MAZE, "algorithm.iterations=2.5"], ["iterations=2.5", "integer"]),
+    "text": ([MAZE, "algorithm.episodes=lots"], ["episodes=lots", "integer"]),
+    "boolean": ([MAZE, "algorithm.iterations=true"], ["iterations=True", "integer"]),
+    "negative budget": ([MAZE, "algorithm.iterations=-3"], ["-3", "at least 1"]),
+    "negative in a list": (
+        ["env=car_on_hill", "algorithm.iterations=[1,2,-3]"],
+        ["[1, 2, -3]", "at least 1"],
+    ),
+    "list of wrong length": (
+        [MAZE, "algorithm.iterations=[1,2]"],
+        ["algorithm.iterations=[1, 2]", "2 entries", "10 tasks"],
+    ),
+    "epsilon": ([MAZE, "algorithm.epsilon=1.5"], ["algorithm.epsilon=1.5", "[0, 1]"]),
+    "not a number": ([MAZE, "env.gamma=nan"], ["env.gamma"]),
+    "gamma": ([MAZE, "env.gamma=1.0"], ["env.gamma=1.0", "[0, 1)"]),
+    "height": ([MAZE, "env.tasks.height=[0.5,1.5]"], ["env.height=1.5", "[0, 1)"]),
+    "mass": (["env=car_on_hill", "env.tasks.mass=[0,1]"], ["env.mass=0"]),
+    "no tasks": ([MAZE, "env.tasks.height=[]"], ["env.tasks", "one value a task"]),
+    "trees": (
+        [MAZE, "algorithm.regressor.trees=0"],
+        ["regressor.trees=0", "at least 1"],
+    ),
+    "curriculum of one": (
+        [MAZE, "env.tasks.height=[0.5]", "curriculum=on"],
+        ["curriculum=on", "one task"],
+    ),
+    "boosting of one": (
+        [MAZE, "env.tasks.height=[0.5]", "boosting=on"],
+        ["boosting=on", "one task"],
+    ),
+    "table of a continuum": (
+        ["env=car_on_hill", "algorithm/regressor=tabular"],
+        ["tabular", "finitely many states"],
+    ),
+    "shared but own data": (
+        [MAZE, "algorithm.dataset=shared"],
+        ["algorithm.dataset=shared", "epsilon must be 1"],
+    ),
+    "sweep without -m": ([MAZE, "curriculum=on,off"], ["curriculum", "-m"]),
+    "unspeakable tag": ([MAZE, "tag=a/b"], ["tag=a/b", "letters"]),
+    "no override": ([MAZE, "curriculum on"], ["KEY=VALUE"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_it_is_refused_by_key_value_and_what_is_allowed(case):
+    overrides, expected = BAD[case]
+    with pytest.raises(BcrlError) as refusal:
+        plans(*overrides)
+    for words in expected:
+        assert words in str(refusal.value)
+
+
+YAMLS = {
+    "wrong type": ("seeds: {count: many}", ["seeds.count", "many"]),
+    "unknown key": ("seeds: {cuont: 3}", ["seeds.cuont"]),
+    "no yaml": ("seeds: [", ["can't be read", "mine.yaml"]),
+    "bare off": ("defaults:\n  - override /curriculum: off", ["quote on and off"]),
+    "bad budget": ("algorithm: {iterations: 0}", ["algorithm.iterations=0"]),
+}
+
+
+@pytest.mark.parametrize("case", YAMLS)
+def test_a_users_yaml_is_vetted_too(case, tmp_path):
+    text, expected = YAMLS[case]
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text(f"# @package _global_\n{text}\n")
+    with pytest.raises(BcrlError) as refusal:
+        plans(MAZE, "experiment=mine", config_dir=str(tmp_path))
+    for words in expected:
+        assert words in str(refusal.value)
+
+
+def test_a_sweep_whose_jobs_would_share_a_directory_is_refused():
+    with pytest.raises(
+        BcrlError, match=r"algorithm.episodes=5 and algorithm.episodes=6"
+    ):
+        plans(MAZE, "algorithm.episodes=5,6", "tag=one", multirun=True)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["env=maz"],
+        ["env=maze", "seeds.count=0"],
+        ["-m", "env=maze", "curriculum=on,of"],
+        ["env=maze", "runs_dir=a_file/below"],
+        ["env=maze", "runs_dir=/proc/runs"],
+        ["env=maze", "--config-dir", "nowhere"],
+        ["env=maze", "--experimental-rerun", "x.pickle"],
+    ],
+)
+def test_the_command_says_so_exits_nonzero_and_writes_nothing(
+    bcrl, tmp_path, arguments
+):
+    (tmp_path / "a_file").write_text("")
+    done = bcrl(*arguments)
+    assert done.returncode == 2
+    assert done.stderr.startswith("bcrl: ") and "Traceback" not in done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["a_file"]

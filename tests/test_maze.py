@@ -1,0 +1,81 @@
+"""The maze's geometry, rewards and presets."""
+
+import numpy as np
+import pytest
+
+from bcrl.envs.maze import Maze
+from bcrl.errors import ConfigError
+
+RIGHT, LEFT, DOWN, UP = 1, 0, 2, 3
+
+
+def step(env, x, y, action):
+    after, reward, absorbing = env.step(np.array([x, y]), np.array(action))
+    return after.tolist(), float(reward), bool(absorbing)
+
+
+def test_moves_are_a_twentieth_and_clipped_to_the_unit_square():
+    env = Maze(0.05)
+    assert step(env, 0.5, 0.5, RIGHT) == ([0.55, 0.5], pytest.approx(-0.85), False)
+    assert step(env, 0.0, 0.5, LEFT)[0] == [0.0, 0.5]
+    assert step(env, 0.4, 1.0, UP)[0] == [0.4, 1.0]
+
+
+def test_walls_block_strictly_inside_and_leave_the_boundary_free():
+    env = Maze(0.95)
+    assert step(env, 0.15, 0.5, RIGHT)[0] == [0.15, 0.5]  # first wall, x = 0.2
+    assert step(env, 0.15, 0.0, RIGHT)[0] == [0.15, 0.0]  # it stands on the floor
+    assert step(env, 0.15, 0.95, RIGHT)[0] == [0.2, 0.95]  # its top edge is free
+    assert step(env, 0.55, 0.05, RIGHT)[0] == [0.6, 0.05]  # below the second wall
+    assert step(env, 0.55, 0.1, RIGHT)[0] == [0.55, 0.1]
+    assert env.blocked(env.states()).sum() == 19 + 19
+
+
+@pytest.mark.parametrize(("preset", "expected"), [("lattice", True), ("paper", False)])
+def test_the_goals_boundary_belongs_to_the_goal_unless_the_text_is_taken_literally(
+    preset, expected
+):
+    boundary = np.array(
+        [[0.85, 0.95], [0.95, 0.85], [0.9, 0.9], [0.9, 1.0], [1.0, 0.9]]
+    )
+    assert (Maze(preset=preset).is_goal(boundary) == expected).all()
+    assert Maze(preset=preset).is_goal(np.array([0.95, 0.95]))
+
+
+def test_reaching_the_goal_pays_five_and_absorbs():
+    assert step(Maze(), 0.8, 0.95, RIGHT) == ([0.85, 0.95], 5.0, True)
+
+
+def test_the_released_preset_accumulates_floats():
+    state = np.zeros(2)
+    for _ in range(3):
+        state, _, _ = Maze(preset="released").step(state, np.array(UP))
+    assert state[1] == 0.15000000000000002  # 0.05 + 0.05 + 0.05
+    assert not Maze(preset="released").finite
+
+
+def test_a_batch_steps_as_its_lanes_do():
+    env, rng = Maze(0.55), np.random.default_rng(0)
+    states, actions = (
+        env.states()[rng.integers(441, size=(3, 5))],
+        rng.integers(4, size=(3, 5)),
+    )
+    together = env.step(states, actions)
+    for lane in np.ndindex(3, 5):
+        alone = env.step(states[lane], actions[lane])
+        assert all(
+            np.array_equal(a[lane], b) for a, b in zip(together, alone, strict=True)
+        )
+
+
+def test_index_inverts_states():
+    env = Maze()
+    assert np.array_equal(env.index(env.states()), np.arange(441))
+
+
+@pytest.mark.parametrize(
+    "bad", [{"height": 1.0}, {"gamma": 1.0}, {"horizon": 0}, {"preset": "relesed"}]
+)
+def test_impossible_constants_are_refused(bad):
+    with pytest.raises(ConfigError):
+        Maze(**bad)

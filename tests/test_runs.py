@@ -1,0 +1,166 @@
+"""Whole runs at smoke scale: records, identical bytes, resume, conflicts."""
+
+import csv
+import hashlib
+import itertools
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bcrl import runner
+from bcrl.errors import BcrlError
+from bcrl.records import is_complete
+from tests.conftest import plan
+
+COLUMNS = {
+    "car_on_hill": "stage,task,iteration,q_error,return",
+    "maze": "stage,task,iteration,return,q_error_start,q_error,residual_start,solved",
+}
+VARIANTS = list(itertools.product(COLUMNS, ("on", "off"), ("on", "off")))
+
+
+def run(folder: Path, env: str, curriculum: str, boosting: str, *more: str):
+    p = plan(
+        f"env={env}",
+        f"curriculum={curriculum}",
+        f"boosting={boosting}",
+        "scale=smoke",
+        "progress=none",
+        f"runs_dir={folder}",
+        *more,
+    )
+    runner.run(p)
+    return p
+
+
+def digest(p, seed: int, suffix: str = "csv") -> str:
+    data = (p.directory / f"seed_{seed:04d}.{suffix}").read_bytes()
+    return hashlib.sha256(data).hexdigest()
+
+
+@pytest.mark.parametrize(("env", "curriculum", "boosting"), VARIANTS)
+def test_a_seed_is_the_same_alone_among_others_and_with_two_workers(
+    tmp_path, env, curriculum, boosting
+):
+    choice = (env, curriculum, boosting)
+    alone = run(tmp_path / "a", *choice, "seeds.first=3", "seeds.count=1", "threads=1")
+    among = run(
+        tmp_path / "b", *choice, "seeds.count=5", "seeds.lockstep=5", "threads=2"
+    )
+    two = run(
+        tmp_path / "c",
+        *choice,
+        "seeds.first=2",
+        "seeds.count=2",
+        "workers=2",
+        "threads=1",
+    )
+    for suffix in ("csv", "npz"):
+        ways = {digest(p, 3, suffix) for p in (alone, among, two)}
+        assert len(ways) == 1, suffix
+    assert len({digest(among, s) for s in range(5)}) == 5  # seeds differ
+
+
+@pytest.mark.parametrize("env", COLUMNS)
+def test_what_a_run_leaves(tmp_path, env):
+    p = run(tmp_path, env, "on", "on")
+    assert p.directory == tmp_path / "smoke" / env / "BC-FQI"
+    names = {f"seed_000{s}.{x}" for s in (0, 1) for x in ("csv", "json", "npz")}
+    assert {f.name for f in p.directory.iterdir()} == names | {"config.yaml"}
+    lines = (p.directory / "seed_0000.csv").read_text().splitlines()
+    assert lines[0] == COLUMNS[env]
+    rows = list(csv.DictReader(lines))
+    assert [int(r["iteration"]) for r in rows] == list(range(1, 2 * len(p.tasks) + 1))
+    assert [int(r["task"]) for r in rows] == [i // 2 + 1 for i in range(len(rows))]
+    assert all(math.isfinite(float(v)) for r in rows for v in r.values())
+    about = json.loads((p.directory / "seed_0000.json").read_text())
+    assert about["status"] == "complete" and about["variant"] == "BC-FQI"
+    assert about["config"]["env"]["name"] == env
+    for key in ("versions", "git", "machine", "cpu_seconds", "wall_seconds"):
+        assert about[key]
+    arrays = np.load(p.directory / "seed_0000.npz", allow_pickle=False)
+    n, a = len(arrays["states"]), p.target.n_actions
+    assert arrays["q"].shape == (n, a)
+    assert arrays["residuals"].shape == (len(p.stages), n, a)
+    # Q is the sum of the residuals: boosting's definition.
+    assert np.allclose(arrays["residuals"].sum(0), arrays["q"], atol=1e-12)
+    if env == "maze":
+        assert about["optimum"] == pytest.approx(-47.557563488, abs=1e-8)
+        assert arrays["trajectory"][0].tolist() == [0.0, 0.0]
+        assert arrays["walls"].shape == (10, 2, 4)
+
+
+def test_a_complete_seed_is_skipped_and_a_missing_one_computed(tmp_path):
+    first = run(tmp_path, "maze", "off", "off", "seeds.count=2")
+    before = {f.name: f.stat().st_mtime_ns for f in first.directory.glob("seed_*")}
+    digests = [digest(first, s) for s in (0, 1)]
+    (first.directory / "seed_0001.json").write_text('{"status": "comp')  # cut off
+    assert not is_complete(first.directory, 1)
+    again = run(tmp_path, "maze", "off", "off", "seeds.count=2")
+    after = {f.name: f.stat().st_mtime_ns for f in again.directory.glob("seed_*")}
+    kept = {name for name in before if before[name] == after[name]}
+    assert kept == {"seed_0000.csv", "seed_0000.json", "seed_0000.npz"}
+    assert [digest(again, s) for s in (0, 1)] == digests
+
+
+def test_a_directory_of_another_config_is_refused_with_the_difference(tmp_path):
+    run(tmp_path, "maze", "off", "off", "tag=mine", "algorithm.episodes=5")
+    with pytest.raises(BcrlError, match=r"algorithm.episodes: there 5, here 6"):
+        run(tmp_path, "maze", "off", "off", "tag=mine", "algorithm.episodes=6")
+
+
+def test_seeds_share_neither_data_nor_trees(tmp_path):
+    """Also where one of the two is made the same by a released option."""
+    choice = ("car_on_hill", "off", "off", "algorithm.dataset=shared")
+    shared = run(tmp_path, *choice)
+    assert digest(shared, 0) != digest(shared, 1)
+
+
+def test_measuring_more_leaves_training_unchanged(tmp_path):
+    few = run(tmp_path, "maze", "on", "on", "env.metrics=[q_error]", "tag=few")
+    all_metrics = run(tmp_path, "maze", "on", "on")
+    for name in ("q", "residuals", "trajectory"):
+        both = [
+            np.load(p.directory / "seed_0000.npz")[name] for p in (few, all_metrics)
+        ]
+        assert np.array_equal(*both)
+
+
+def test_the_released_maze_and_scikit_learns_forest_run(tmp_path):
+    small = ("algorithm.regressor.trees=3", "seeds.count=1")
+    released = run(tmp_path, "maze", "on", "on", "env.preset=released", *small)
+    judge = run(
+        tmp_path, "maze", "on", "on", "algorithm/regressor=sklearn_forest", *small
+    )
+    for p in (released, judge):
+        assert is_complete(p.directory, 0)
+        assert p.name.startswith("BC-FQI@")
+
+
+def test_the_command_runs_a_sweep_and_prints_a_line_a_task(bcrl, tmp_path):
+    sweep = ("env=maze", "curriculum=on,off", "scale=smoke", "seeds.count=1")
+    done = bcrl("-m", *sweep, "algorithm/regressor=tabular", "tag=t")
+    assert done.returncode == 0, done.stderr
+    assert "C-FQI@t · T10 · iteration 20/20 · seed 0" in done.stderr
+    made = sorted(
+        p.parent.name for p in tmp_path.glob("runs/smoke/maze/*/seed_0000.csv")
+    )
+    assert made == ["C-FQI@t", "FQI@t"]
+
+
+def test_help_and_cfg_teach(bcrl, tmp_path):
+    shown = bcrl("--help")
+    assert shown.returncode == 0
+    for words in (
+        "Usage: bcrl",
+        "curriculum: off, on",
+        "experiment=fig1",
+        "seeds.first",
+    ):
+        assert words in shown.stdout
+    composed = bcrl("env=maze", "--cfg", "job")
+    assert composed.returncode == 0 and "height" in composed.stdout
+    assert not list(tmp_path.iterdir())
