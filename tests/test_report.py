@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 import bcrl.report
-from bcrl.report import cli, figures, files, style, verdicts
+from bcrl import files
+from bcrl.report import cli, figures, style, verdicts
 from bcrl.report import statistics as st
 from bcrl.report.document import claims_report
 from bcrl.report.load import METHODS, METRICS, load_runs

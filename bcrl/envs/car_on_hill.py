@@ -102,8 +102,7 @@ def _acceleration(p: float, v: float, pull: float, left: bool) -> float:
     if left:
         slope = 2.0 * p + 1.0
         return (pull - slope * (GRAVITY + 2.0 * v * v)) / (1.0 + slope * slope)
-    # with q = 1 + 5p², both sides of the fraction are multiplied by q⁴: one root and one
-    # division remain, which are what this function's time goes into
+    # with q = 1 + 5p², numerator and denominator times q⁴: one root and one division
     q = 1.0 + 5.0 * p * p
     q2 = q * q
     force = pull * q2 * q2 - GRAVITY * q2 * math.sqrt(q) + 15.0 * p * v * v
@@ -179,7 +178,7 @@ def _cross(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def advance(p: float, v: float, pull: float) -> tuple[float, float]:
+def _advance(p: float, v: float, pull: float) -> tuple[float, float]:
     """(p, v) after 0.1 s under `pull` = u / m [m/s²], whatever the bounds.
 
     A fixed step over the jump of h'' at p = 0 would be off by its length, so every step
@@ -211,7 +210,7 @@ def advance(p: float, v: float, pull: float) -> tuple[float, float]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def outcome(p: float, v: float) -> float:
+def _outcome(p: float, v: float) -> float:
     """Reward on arriving at (p, v): +1 at the goal, −1 if lost (NaN too), else 0."""
     if not (p >= -MAX_POSITION and abs(v) <= MAX_SPEED):
         return -1.0
@@ -230,9 +229,9 @@ def _steps(
         p, v = state[i]
         if action[i] != 0 and action[i] != 1:
             raise IndexError("car_on_hill has the actions 0 (left) and 1 (right)")
-        if outcome(p, v) == 0.0:
-            p, v = advance(p, v, (FORCE if action[i] == 1 else -FORCE) / mass)
-            reward[i] = outcome(p, v)
+        if _outcome(p, v) == 0.0:
+            p, v = _advance(p, v, (FORCE if action[i] == 1 else -FORCE) / mass)
+            reward[i] = _outcome(p, v)
             absorbing[i] = reward[i] != 0.0
         after[i, 0], after[i, 1] = p, v
     return after, reward, absorbing

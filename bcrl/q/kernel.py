@@ -1,4 +1,4 @@
-"""Compiled extra-trees: grows a forest and carries query rows down while it grows.
+"""Compiled parts of the forest: keys, random cuts, sums over rows, moving rows.
 
 Three representations make the loops fast and the results exact:
 
@@ -12,11 +12,13 @@ Three representations make the loops fast and the results exact:
 Because sums are exact, a row of multiplicity 3 and three equal rows give the same tree
 bit for bit, and so does any order of the rows.
 
-A buffer holds three **planes**: the rows as given, and two that levels of the tree use
-in turn. Indices are unsigned because numba checks signed ones for being negative.
+A buffer holds three **planes**: the rows as given, and two that the levels of a tree
+use in turn. Indices are unsigned because numba checks signed ones for being negative.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -73,9 +75,44 @@ def draw_cut(low, high, bits):
     return np.int32(key_of(near) - np.int32(np.float64(near) > threshold))
 
 
+class Split(NamedTuple):
+    """A chosen split: feature (−1: none), cut, weight and target sum of the left."""
+
+    feature: int
+    cut: np.int32
+    weight: np.int64
+    total: np.int64
+
+
+@njit
+def new_rows(x, carries, weighted):
+    """Buffers whose first plane holds `x` (size, d); targets and weights to be filled.
+
+    keys: (3·d·size,) int32, within a plane feature by feature; row: (3·size,) uint32,
+    the index the row was given under; target: (3·size,) int64, or empty for query rows;
+    weight: (3·size,) int64 multiplicities, or empty if all are 1.
+    """
+    size, d = U(x.shape[0]), U(x.shape[1])
+    keys = np.empty(U(3) * d * size, np.int32)
+    row = np.empty(U(3) * size, np.uint32)
+    for i in range(size):
+        row[i] = i
+        for f in range(d):
+            keys[f * size + i] = key_of(x[i, f])
+    target = np.empty(U(3) * size if carries else ZERO, np.int64)
+    weight = np.empty(U(3) * size if weighted else ZERO, np.int64)
+    return keys, row, target, weight
+
+
+@njit
+def plane(depth):
+    """The plane that a node of this depth lies in."""
+    return ZERO if depth == 0 else U(1 + (depth & 1))
+
+
 @njit
 def is_pure(target, weight, start, stop, total_weight, unit):
-    """Whether the variance of `target[start:stop]` is at most PURE.
+    """Whether the variance of the targets at `start:stop` is at most PURE.
 
     Two rows at a distance δ alone give a variance of δ² / (2 · total weight) or more:
     a mixed node is told after a row or two.
@@ -83,7 +120,7 @@ def is_pure(target, weight, start, stop, total_weight, unit):
     first = target[start]
     limit = 2.0 * total_weight * PURE
     mean, square = 0.0, 0.0
-    for i in range(start, stop):
+    for i in range(start + ONE, stop):
         far = np.float64(target[i] - first) * unit
         if far * far > limit:
             return False
@@ -94,41 +131,135 @@ def is_pure(target, weight, start, stop, total_weight, unit):
 
 
 @njit
-def bounds(keys, start, stop):
-    """Smallest and largest of `keys[start:stop]`."""
-    low = keys[start]
-    high = low
-    for i in range(start + ONE, stop):
-        low = min(low, keys[i])
-        high = max(high, keys[i])
-    return low, high
+def gain(low, high, weight, total, node_weight, node_total, min_leaf):
+    """Variance reduction of a split up to a factor common to the node; −1: not allowed.
+
+    Mirrored splits give exactly the same number, so that ties are ties.
+    """
+    right = node_weight - weight
+    if (
+        weight < min_leaf
+        or right < min_leaf
+        or value_of(high) <= np.float32(value_of(low) + CONSTANT)
+    ):
+        return -1.0
+    gap = np.float64(total) * right - np.float64(node_total - total) * weight
+    return gap * gap / (np.float64(weight) * right)
 
 
 @njit
-def left_sums(keys, base, target, weight, start, stop, cut):
-    """Weight and weighted sum of targets over the rows that go left."""
-    count, total = np.int64(0), np.int64(0)
+def choose_two(
+    keys, target, weight, size, base, here, start, stop, w_node, s_node, min_leaf, state
+):
+    """`choose` for two features, both tried: both in one pass over the rows."""
+    one = base + size
+    low0 = high0 = keys[base + start]
+    low1 = high1 = keys[one + start]
+    for i in range(start + ONE, stop):
+        key0, key1 = keys[base + i], keys[one + i]
+        low0, high0 = min(low0, key0), max(high0, key0)
+        low1, high1 = min(low1, key1), max(high1, key1)
+    state += GOLDEN
+    bits = mix(state)
+    cut0 = draw_cut(low0, high0, bits >> U(32))
+    cut1 = draw_cut(low1, high1, bits & LOW32)
+    w0 = w1 = s0 = s1 = np.int64(0)
     if weight.size > 0:
         for i in range(start, stop):
-            goes = -np.int64(keys[base + i] <= cut)
-            count += weight[i] & goes
-            total += (weight[i] * target[i]) & goes
+            w = weight[here + i]
+            wy = w * target[here + i]
+            goes0 = -np.int64(keys[base + i] <= cut0)  # all bits set, or none
+            goes1 = -np.int64(keys[one + i] <= cut1)
+            w0 += w & goes0
+            s0 += wy & goes0
+            w1 += w & goes1
+            s1 += wy & goes1
     else:
         for i in range(start, stop):
-            goes = -np.int64(keys[base + i] <= cut)
-            count -= goes
-            total += target[i] & goes
-    return count, total
+            y = target[here + i]
+            goes0 = -np.int64(keys[base + i] <= cut0)
+            goes1 = -np.int64(keys[one + i] <= cut1)
+            w0 -= goes0
+            s0 += y & goes0
+            w1 -= goes1
+            s1 += y & goes1
+    gain0 = gain(low0, high0, w0, s0, w_node, s_node, min_leaf)
+    gain1 = gain(low1, high1, w1, s1, w_node, s_node, min_leaf)
+    second = gain1 > gain0
+    if gain0 == gain1:
+        state += GOLDEN
+        second = (mix(state) >> U(63)) == ONE
+    if max(gain0, gain1) < 0.0:
+        return Split(-1, cut0, w0, s0), state
+    if second:
+        return Split(1, cut1, w1, s1), state
+    return Split(0, cut0, w0, s0), state
 
 
 @njit
-def move_rows(keys, base, out, size, d, by, start, stop, cut, row, target, weight, a, b):
-    """Move rows to the other plane, those with `key <= cut` first; where these end.
+def choose(
+    keys, target, weight, size, base, here, start, stop, w_node, s_node, min_leaf, state,
+    max_features, order,
+):
+    """The best of the tried features by variance reduction, each cut at random.
 
-    `base`, `out`: where the two planes of keys start; `a`, `b`: of everything else.
+    Features are visited in random order: ties between them fall either way. As in
+    scikit-learn a constant feature counts as tried, but at least one other is.
+    base, here: where the node's plane begins in keys, and in everything else; w_node,
+    s_node: weight and sum of the node; order: (d,) a permutation of the features, shuffled further.
     """
+    best, split = -1.0, Split(-1, np.int32(0), np.int64(0), np.int64(0))
+    left = order.size
+    tried, constants = 0, 0
+    while left > 0 and (tried < max_features or tried == constants):
+        state += GOLDEN
+        bits = mix(state)
+        pick = np.int64(((bits & LOW32) * U(left)) >> U(32))
+        left -= 1
+        tried += 1
+        feature = order[pick]
+        order[pick] = order[left]
+        order[left] = feature
+        column = base + U(feature) * size
+        low = high = keys[column + start]
+        for i in range(column + start + ONE, column + stop):
+            low, high = min(low, keys[i]), max(high, keys[i])
+        if value_of(high) <= np.float32(value_of(low) + CONSTANT):
+            constants += 1
+            continue
+        cut = draw_cut(low, high, bits >> U(32))
+        w = s = np.int64(0)
+        for i in range(start, stop):
+            goes = -np.int64(keys[column + i] <= cut)
+            if weight.size > 0:
+                w += weight[here + i] & goes
+                s += (weight[here + i] * target[here + i]) & goes
+            else:
+                w -= goes
+                s += target[here + i] & goes
+        score = gain(low, high, w, s, w_node, s_node, min_leaf)
+        if score > best:
+            best, split = score, Split(feature, cut, w, s)
+    return split, state
+
+
+@njit
+def move(keys, row, target, weight, size, d, depth, start, stop, feature, cut):
+    """Move a node's rows to its children's plane, left ones first; where these end."""
+    a, b = plane(depth) * size, plane(depth + 1) * size
+    base, out = a * d, b * d
+    by = base + U(feature) * size
     left, right = start, stop - ONE
-    if d == TWO and weight.size == 0:
+    if d == TWO and target.size == 0:
+        for i in range(start, stop):
+            goes = U(keys[by + i] <= cut)
+            p = left if goes else right
+            keys[out + p] = keys[base + i]
+            keys[out + size + p] = keys[base + size + i]
+            row[b + p] = row[a + i]
+            left += goes
+            right -= ONE - goes
+    elif d == TWO:
         for i in range(start, stop):
             goes = U(keys[by + i] <= cut)
             p = left if goes else right
@@ -136,6 +267,8 @@ def move_rows(keys, base, out, size, d, by, start, stop, cut, row, target, weigh
             keys[out + size + p] = keys[base + size + i]
             row[b + p] = row[a + i]
             target[b + p] = target[a + i]
+            if weight.size > 0:
+                weight[b + p] = weight[a + i]
             left += goes
             right -= ONE - goes
     else:
@@ -145,7 +278,8 @@ def move_rows(keys, base, out, size, d, by, start, stop, cut, row, target, weigh
             for f in range(d):
                 keys[out + f * size + p] = keys[base + f * size + i]
             row[b + p] = row[a + i]
-            target[b + p] = target[a + i]
+            if target.size > 0:
+                target[b + p] = target[a + i]
             if weight.size > 0:
                 weight[b + p] = weight[a + i]
             left += goes
@@ -154,8 +288,10 @@ def move_rows(keys, base, out, size, d, by, start, stop, cut, row, target, weigh
 
 
 @njit
-def move_queries(keys, base, out, size, d, by, start, stop, cut, row, a, b):
-    """`move_rows` for query rows, which carry no target."""
+def move_queries(keys, row, size, d, depth, start, stop, feature, cut):
+    a, b = plane(depth) * size, plane(depth + 1) * size
+    base, out = a * d, b * d
+    by = base + U(feature) * size
     left, right = start, stop - ONE
     if d == TWO:
         for i in range(start, stop):
@@ -179,167 +315,7 @@ def move_queries(keys, base, out, size, d, by, start, stop, cut, row, a, b):
 
 
 @njit
-def choose(
-    keys, base, size, target, weight, a, start, stop, total, total_sum,
-    min_leaf, max_features, order, state,
-):
-    """The best of the tried features by variance reduction, each cut at random."""
-    best, feature, best_cut = -1.0, -1, np.int32(0)
-    best_weight, best_sum = np.int64(0), np.int64(0)
-    left = order.size
-    visited, constants = 0, 0
-    while left > 0 and (visited < max_features or visited == constants):
-        state += GOLDEN
-        bits = mix(state)
-        pick = np.int64(((bits & LOW32) * U(left)) >> U(32))
-        left -= 1
-        f = order[pick]
-        order[pick] = order[left]
-        order[left] = f
-        visited += 1
-        column = base + U(f) * size
-        low, high = bounds(keys, column + start, column + stop)
-        if value_of(high) <= np.float32(value_of(low) + CONSTANT):
-            constants += 1
-            continue
-        cut = draw_cut(low, high, bits >> U(32))
-        w_left, s_left = left_sums(
-            keys, column - a, target, weight, a + start, a + stop, cut
-        )
-        w_right = total - w_left
-        if w_left < min_leaf or w_right < min_leaf:
-            continue
-        gap = np.float64(s_left) * w_right - np.float64(total_sum - s_left) * w_left
-        score = gap * gap / (np.float64(w_left) * w_right)
-        if score > best:
-            best, feature, best_cut = score, f, cut
-            best_weight, best_sum = w_left, s_left
-    return feature, best_cut, best_weight, best_sum, state
-
-
-@njit
-def grow_tree(
-    keys, target, weight, row, qkeys, qrow, none, d, n, m, total_weight, total_sum, unit,
-    min_split, min_leaf, max_features,
-    state, order, stack, fitted, queried, nodes, values, keep,
-):
-    n_nodes, n_leaves, deepest, top = 1, 0, 0, 0
-    node, depth = 0, 0
-    start, stop, qstart, qstop = ZERO, n, ZERO, m
-    w_node, s_node = total_weight, total_sum
-    dn, dm = d * n, d * m
-    while True:
-        feature = -1
-        cut = np.int32(0)
-        w_left, s_left = np.int64(0), np.int64(0)
-        src = U(0) if depth == 0 else U(2 - (depth & 1))
-        x0 = src * dn
-        y0 = src * n
-        if w_node >= min_split and w_node >= 2 * min_leaf and not is_pure(
-            target, weight, y0 + start, y0 + stop, w_node, unit
-        ):
-            feature, cut, w_left, s_left, state = choose(keys, x0, n, target, weight, y0, start, stop, w_node, s_node, min_leaf, max_features, order, state)
-        if feature < 0:
-            value = s_node * unit / w_node
-            for i in range(y0 + start, y0 + stop):
-                fitted[row[i]] += value
-            q0 = src * m
-            for i in range(q0 + qstart, q0 + qstop):
-                queried[qrow[i]] += value
-            if keep:
-                nodes[node].cut = 0
-                nodes[node].feature = -1
-                nodes[node].child = n_leaves
-                values[n_leaves] = value
-            n_leaves += 1
-            deepest = max(deepest, depth)
-            if top == 0:
-                break
-            top -= 1
-            node = stack[top, 0]
-            depth = stack[top, 1]
-            start, stop = U(stack[top, 2]), U(stack[top, 3])
-            qstart, qstop = U(stack[top, 4]), U(stack[top, 5])
-            w_node, s_node = stack[top, 6], stack[top, 7]
-            continue
-        dst = U(2 - ((depth + 1) & 1))
-        left = move_rows(keys, x0, dst*dn, n, d, x0+U(feature)*n, start, stop, cut, row, target, weight, y0, dst*n)
-        qleft = qstart
-        if qstart < qstop:
-            qleft = move_queries(qkeys, src*dm, dst*dm, m, d, src*dm+U(feature)*m, qstart, qstop, cut, qrow, src*m, dst*m)
-        child = n_nodes
-        n_nodes += 2
-        if keep:
-            nodes[node].cut = cut
-            nodes[node].feature = feature
-            nodes[node].child = child
-        depth += 1
-        stack[top, 0] = child + 1
-        stack[top, 1] = depth
-        stack[top, 2] = left
-        stack[top, 3] = stop
-        stack[top, 4] = qleft
-        stack[top, 5] = qstop
-        stack[top, 6] = w_node - w_left
-        stack[top, 7] = s_node - s_left
-        top += 1
-        node = child
-        stop = left
-        qstop = qleft
-        w_node, s_node = w_left, s_left
-    return n_nodes, n_leaves, deepest
-@njit(nogil=True)
-def grow_forest(x, y, mult, seeds, queries, min_split, min_leaf, max_features, keep):
-    n, d = U(x.shape[0]), U(x.shape[1])
-    m = U(queries.shape[0])
-    weighted = mult.size > 0
-    total_weight = np.int64(0)
-    if weighted:
-        for i in range(mult.size):
-            total_weight += mult[i]
-    else:
-        total_weight = np.int64(n)
-    big = 0.0
-    for i in range(y.size):
-        big = max(big, abs(y[i]))
-    bits = 61 - int(np.ceil(np.log2(big * total_weight))) if big > 0 else 0
-    unit = 2.0 ** -bits
-    keys = np.empty(U(3) * d * n, np.int32)
-    target = np.empty(U(3) * n, np.int64)
-    weight = np.empty(U(3) * n if weighted else ZERO, np.int64)
-    row = np.empty(U(3) * n, np.uint32)
-    qkeys = np.empty(U(3) * d * m, np.int32)
-    qrow = np.empty(U(3) * m, np.uint32)
-    total_sum = np.int64(0)
-    for i in range(n):
-        target[i] = np.int64(np.rint(y[i] * 2.0**bits))
-        row[i] = i
-        if weighted:
-            weight[i] = mult[i]
-            total_sum += target[i] * mult[i]
-        else:
-            total_sum += target[i]
-        for f in range(d):
-            keys[f * n + i] = key_of(x[i, f])
-    for i in range(m):
-        qrow[i] = i
-        for f in range(d):
-            qkeys[f * m + i] = key_of(queries[i, f])
-    fitted = np.zeros(n)
-    queried = np.zeros(m)
-    none = np.empty(0, np.int64)
-    order = np.arange(x.shape[1])
-    stack = np.empty((n + ONE, 8), np.int64)
-    nodes = np.empty(U(2) * n if keep else ZERO, NODE)
-    values = np.empty(n if keep else ZERO, np.float64)
-    counts = np.empty(seeds.size, np.int64)
-    depths = np.empty(seeds.size, np.int64)
-    for t in range(seeds.size):
-        a, b, c = grow_tree(
-            keys, target, weight, row, qkeys, qrow, none,
-            d, n, m, total_weight, total_sum, unit,
-            min_split, min_leaf, max_features,
-            seeds[t], order, stack, fitted, queried, nodes, values, keep,
-        )
-        counts[t], depths[t] = a, c
-    return counts, depths, fitted / seeds.size, queried / seeds.size
+def add_value(row, start, stop, value, total):
+    """Add a leaf's value to `total` at the rows that lie in it."""
+    for i in range(start, stop):
+        total[row[i]] += value
