@@ -43,6 +43,7 @@ lint: $(READY) ## style and unused code
 
 bench: $(READY) ## speed, as ratios against scikit-learn in one run
 	$(BIN)/python bench/forest.py
+	$(BIN)/python bench/iteration.py
 
 clean: ## remove .venv and caches; results in runs/ stay
 	rm -rf $(VENV) .pytest_cache .ruff_cache

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.envs import Env, is_finite
-from bcrl.rollout import Episodes
+from bcrl.rollout import Episodes, transition_tables
 
 
 @dataclass(frozen=True)
@@ -44,25 +44,34 @@ def build(env: Env, episodes: Episodes, seed: int, probe: NDArray) -> Dataset:
     """The dataset of seed number `seed` of `episodes`; `probe` (n, d) are asked too."""
     seen = np.arange(episodes.reward.shape[-1]) < episodes.length[seed][:, None]
     before = episodes.state[seed, :, :-1][seen]
-    after = episodes.state[seed, :, 1:][seen]
+    action = episodes.action[seed][seen]
     if is_finite(env):
         points = env.states().astype(np.float32)
-        state, next_state, probed = map(env.index, (before, after, probe))
+        probed = env.index(probe)
+        pair = env.index(before) * env.n_actions + action
+        seen_how_often = np.bincount(pair)
+        pairs = np.flatnonzero(seen_how_often)
+        state, action = np.divmod(pairs, env.n_actions)
+        next_state, reward, absorbing = (
+            table[state, action] for table in transition_tables(env)
+        )
+        multiplicity = seen_how_often[pairs]
     else:
+        after = episodes.state[seed, :, 1:][seen]
         every = np.concatenate([before, after, probe]).astype(np.float32)
         first, label = _distinct(every.T)
         points = every[first]
         state, next_state, probed = np.split(label, [len(before), 2 * len(before)])
-    columns = (
-        state,
-        episodes.action[seed][seen],
-        episodes.reward[seed][seen],
-        next_state,
-        episodes.absorbing[seed][seen],
-    )
-    first, label = _distinct(columns)
-    state, action, reward, next_state, absorbing = (c[first] for c in columns)
-    multiplicity = np.bincount(label, minlength=len(first))
+        columns = (
+            state,
+            action,
+            episodes.reward[seed][seen],
+            next_state,
+            episodes.absorbing[seed][seen],
+        )
+        first, label = _distinct(columns)
+        state, action, reward, next_state, absorbing = (c[first] for c in columns)
+        multiplicity = np.bincount(label, minlength=len(first))
     by_action = tuple(
         _action_rows(points, state, np.flatnonzero(action == a), multiplicity)
         for a in range(env.n_actions)

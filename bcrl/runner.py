@@ -39,10 +39,11 @@ def run(plan: Plan) -> None:
 
 
 def _groups(plan: Plan, seeds: list[int]) -> list[Seeds]:
-    """Seeds that train together: as many as allowed, but no worker left without."""
-    workers = plan.config["workers"]
-    size = min(plan.config["seeds"]["lockstep"], -(-len(seeds) // workers))
-    return [tuple(seeds[i : i + size]) for i in range(0, len(seeds), size)]
+    """Seeds that train together: at most as allowed, spread evenly over the workers."""
+    workers = min(plan.config["workers"], len(seeds))
+    rounds = -(-len(seeds) // (plan.config["seeds"]["lockstep"] * workers))
+    groups = min(rounds * workers, len(seeds))
+    return [tuple(part.tolist()) for part in np.array_split(seeds, groups)]
 
 
 def _train(plan: Plan, groups: list[Seeds], tick: Callable[[Tick], None]) -> None:

@@ -9,7 +9,7 @@ from bcrl.bellman import residual_target
 from bcrl.learners.fqi import FQI, Stage
 from bcrl.oracle.maze import optimal_q
 from bcrl.q import ZERO, Sum, Table, Zero, add
-from bcrl.q.regressors import ExtraTrees, Tabular
+from bcrl.q.regressors import ForestRegressor, Tabular
 from bcrl.rollout import transition_tables
 from bcrl.transfer import boost, warm_start
 from tests.toys import Corridor, OpenCorridor
@@ -68,7 +68,7 @@ def test_a_boosted_stage_starts_at_the_previous_q_and_a_zero_residual():
 
 
 def test_tabulated_and_general_evaluation_agree_with_the_same_forests():
-    trees = ExtraTrees(trees=5)
+    trees = ForestRegressor(trees=5)
     fast, _ = learn([Corridor(), Corridor(prize=2.0)], boost, trees, iterations=4)
     plain, _ = learn(
         [OpenCorridor(), OpenCorridor(prize=2.0)], boost, trees, iterations=4
@@ -107,9 +107,9 @@ def test_a_kept_dataset_is_not_collected_again():
 
 
 def test_released_options_share_data_and_fix_the_trees_randomness():
-    own = FQI((0, 1), ExtraTrees(trees=2), warm_start)
-    shared = FQI((0, 1), ExtraTrees(trees=2), warm_start, shared_data=True)
-    fixed = FQI((0, 1), ExtraTrees(trees=2), warm_start, fixed_trees=True)
+    own = FQI((0, 1), ForestRegressor(trees=2), warm_start)
+    shared = FQI((0, 1), ForestRegressor(trees=2), warm_start, shared_data=True)
+    fixed = FQI((0, 1), ForestRegressor(trees=2), warm_start, fixed_trees=True)
     (stage,) = stages([OpenCorridor()], iterations=2, new_data=(True,))
     runs = [list(x.run([stage], Corridor().states())) for x in (own, shared, fixed)]
     assert own._datasets[0] is not own._datasets[1]

@@ -10,7 +10,15 @@ from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_array, check_is_fitted, validate_data
 
-from bcrl.q.forest import Forest, Regression, TreeSettings, fit_forests
+from bcrl.errors import BcrlError
+from bcrl.q.forest import (
+    Forest,
+    Regression,
+    TreeSettings,
+    fit_forests,
+    join,
+    predict_forests,
+)
 
 
 class ExtraTrees(RegressorMixin, BaseEstimator):
@@ -29,8 +37,7 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
     random_state : int, RandomState or None, default None
         Where the trees' seeds come from. An integer gives the same trees at every fit.
     n_jobs : int or None, default None
-        Threads of a fit of several forests; kept for compatibility, one forest is
-        fitted by one thread. Never changes a result.
+        Threads; None is 1, −1 is one per core. Never changes a result.
 
     Attributes
     ----------
@@ -80,12 +87,27 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
         settings = TreeSettings(
             self.min_samples_split, self.min_samples_leaf, self.max_features
         )
-        regression = Regression(X, np.asarray(y, np.float64), seeds, multiplicity)
-        self.forest_ = fit_forests([regression], settings)[0].forest
+        y, threads = np.asarray(y, np.float64), self._threads()
+        parts = [
+            Regression(X, y, part, multiplicity)
+            for part in np.array_split(seeds, min(threads, self.n_estimators))
+        ]
+        try:
+            fits = fit_forests(parts, settings, threads=threads)
+        except BcrlError as error:
+            raise ValueError(str(error)) from None
+        self.forest_ = join([fit.forest for fit in fits])
         return self
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Mean of the trees at X (n, d): (n,) float64."""
         check_is_fitted(self)
         X = validate_data(self, X, dtype=np.float32, order="C", reset=False)
-        return self.forest_.predict(X)
+        parts = np.array_split(X, min(self._threads(), len(X)))
+        forests = [self.forest_] * len(parts)
+        return np.concatenate(predict_forests(forests, parts, threads=self._threads()))
+
+    def _threads(self) -> int:
+        """How many threads `n_jobs` stands for."""
+        jobs, cores = self.n_jobs, os.cpu_count() or 1
+        return 1 if jobs is None else max(jobs if jobs > 0 else cores + 1 + jobs, 1)

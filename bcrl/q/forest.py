@@ -23,7 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bcrl.errors import BcrlError, ConfigError
-from bcrl.q.grow import grow_forest, predict_forest
+from bcrl.q.descend import predict_forest
+from bcrl.q.grow import grow_forest
 
 #: Stand-ins for what a regression leaves out.
 NO_COUNTS = np.empty(0, np.int64)
@@ -92,6 +93,21 @@ class Fitted:
     queried: np.ndarray
 
 
+def join(forests: Sequence[Forest]) -> Forest:
+    """One forest of all the trees of `forests`, in order."""
+    nodes = np.concatenate([forest.nodes for forest in forests])
+    first, trees, at, leaves = [np.zeros(1, np.int64)], [], 0, 0
+    for forest in forests:
+        part = nodes[at : at + len(forest.nodes)]
+        part["child"] += np.where(part["feature"] < 0, leaves, at).astype(np.int32)
+        first.append(forest.first[1:] + at)
+        trees.append(forest.depths)
+        at, leaves = at + len(part), leaves + len(forest.values)
+    values = np.concatenate([forest.values for forest in forests])
+    starts, depths = np.concatenate(first), np.concatenate(trees)
+    return Forest(nodes, values, starts, depths, forests[0].n_features)
+
+
 def fit_forests(
     regressions: Sequence[Regression],
     settings: TreeSettings,
@@ -105,18 +121,18 @@ def fit_forests(
     Raises ConfigError for settings, BcrlError for data that no forest can be fitted to.
     """
     limits = _limits(settings)
+    most = settings.max_features
     checked = [_checked(regression) for regression in regressions]
 
     def fit(arguments: tuple[np.ndarray, ...]) -> Fitted:
         d = arguments[0].shape[1]
-        numbers = (*limits, d if settings.max_features is None else min(max_most, d))
+        numbers = (*limits, d if most is None else min(int(most), d))
         nodes, values, first, depths, fitted, queried = grow_forest(
             *arguments, numbers, keep
         )
         forest = Forest(nodes, values, first, depths, d) if keep else None
         return Fitted(forest, fitted, queried)
 
-    max_most = settings.max_features or 0
     return _spread(fit, checked, threads)
 
 
@@ -158,7 +174,9 @@ def _points(name: str, x: np.ndarray, d: int | None = None) -> np.ndarray:
     """`x` as finite (n, d) float32 in C order, uncopied if it is that already."""
     x = np.ascontiguousarray(x, np.float32)
     if x.ndim != 2 or x.shape[1] < 1 or (d is not None and x.shape[1] != d):
-        raise BcrlError(f"{name} has shape {x.shape}, expected (rows, {d or 'features'})")
+        raise BcrlError(
+            f"{name} has shape {x.shape}, expected (rows, {d or 'features'})"
+        )
     if not np.isfinite(x).all():
         raise BcrlError(f"{name} holds NaN, infinity or values too large for float32")
     return x

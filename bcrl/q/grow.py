@@ -1,38 +1,42 @@
-"""Compiled extra-trees: grow forests and send rows down them."""
+"""Compiled extra-trees: growing a forest, query rows going down with it."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-from bcrl.q.kernel import (
-    NODE,
-    TWO,
-    ZERO,
-    U,
-    add_value,
-    choose,
-    choose_two,
-    is_pure,
-    key_of,
-    move,
-    move_queries,
-    new_rows,
-    plane,
-)
-
-#: Query rows from which moving them down a tree together beats walking one by one.
-TOGETHER = 200
+from bcrl.q.kernel import NODE, TWO, ZERO, U, bare, choose, choose_two, is_pure
+from bcrl.q.rows import add_value, move_queries, move_rows, new_rows, plane
 
 
-@njit
+@bare
 def grow_tree(
-    keys, row, target, weight, q_keys, q_row, d, w_node, s_node, unit, settings, state,
-    order, stack, fitted, queried, nodes, n_nodes, values, n_values, keep,
+    keys,
+    row,
+    target,
+    weight,
+    q_keys,
+    q_row,
+    d,
+    w_node,
+    s_node,
+    unit,
+    settings,
+    state,
+    order,
+    stack,
+    fitted,
+    queried,
+    nodes,
+    n_nodes,
+    values,
+    n_values,
+    keep,
 ):
     """Grow one tree depth first and add its predictions to `fitted` and `queried`.
 
-    weight, total: of all rows; unit: target of fixed-point 1; settings: as in
+    keys … weight, q_keys, q_row: buffers of `new_rows`; w_node, s_node: weight and sum
+    of targets of all rows; unit: target of fixed-point 1; settings: as in
     `grow_forest`; nodes, values: where to put the tree if `keep`, from `n_nodes` and
     `n_values` on. Returns the new `n_nodes`, `n_values`, and the tree's depth.
     """
@@ -53,13 +57,35 @@ def grow_tree(
         ):
             if both:
                 split, state = choose_two(
-                    keys, target, weight, size, base, here, start, stop, w_node, s_node,
-                    min_leaf, state,
+                    keys,
+                    target,
+                    weight,
+                    size,
+                    base,
+                    here,
+                    start,
+                    stop,
+                    w_node,
+                    s_node,
+                    min_leaf,
+                    state,
                 )
             else:
                 split, state = choose(
-                    keys, target, weight, size, base, here, start, stop, w_node, s_node,
-                    min_leaf, state, max_features, order,
+                    keys,
+                    target,
+                    weight,
+                    size,
+                    base,
+                    here,
+                    start,
+                    stop,
+                    w_node,
+                    s_node,
+                    min_leaf,
+                    state,
+                    max_features,
+                    order,
                 )
             feature, cut, w_left, s_left = split
         if feature < 0:
@@ -82,7 +108,7 @@ def grow_tree(
             q_start, q_stop = U(stack[top, 4]), U(stack[top, 5])
             w_node, s_node = stack[top, 6], stack[top, 7]
             continue
-        middle = move(
+        middle = move_rows(
             keys, row, target, weight, size, d, depth, start, stop, feature, cut
         )
         q_middle = q_start
@@ -154,68 +180,28 @@ def grow_forest(x, y, multiplicity, seeds, queries, settings, keep):
             room = leaves + most + (trees - t) * leaves // t
             nodes, values = grown(nodes, 2 * room), grown(values, room)
         first[t + 1], leaves, depths[t] = grow_tree(
-            keys, row, target, weight, q_keys, q_row, U(x.shape[1]), w_all, s_all,
-            2.0**-bits, settings, seeds[t], order, stack, fitted, queried, nodes,
-            first[t], values, leaves, keep,
+            keys,
+            row,
+            target,
+            weight,
+            q_keys,
+            q_row,
+            U(x.shape[1]),
+            w_all,
+            s_all,
+            2.0**-bits,
+            settings,
+            seeds[t],
+            order,
+            stack,
+            fitted,
+            queried,
+            nodes,
+            first[t],
+            values,
+            leaves,
+            keep,
         )
     if keep:
         nodes, values = nodes[: first[trees]].copy(), values[:leaves].copy()
     return nodes, values, first, depths, fitted / trees, queried / trees
-
-
-@njit
-def send_down(keys, row, none, d, nodes, values, root, stack, total):
-    """Add one tree's predictions to `total`, moving all rows down together."""
-    node, depth, top = root, 0, 0
-    size = U(total.size)
-    start, stop = ZERO, size
-    while True:
-        child = nodes[node].child
-        if nodes[node].feature < 0:
-            here = plane(depth) * size
-            add_value(row, here + start, here + stop, values[child], total)
-        else:
-            cut, feature = nodes[node].cut, nodes[node].feature
-            middle = move(
-                keys, row, none, none, size, d, depth, start, stop, feature, cut
-            )
-            depth += 1
-            if middle < stop:
-                stack[top, 0], stack[top, 1] = child + 1, depth
-                stack[top, 2], stack[top, 3] = middle, stop
-                top += 1
-            if start < middle:
-                node, stop = np.int64(child), middle
-                continue
-        if top == 0:
-            return
-        top -= 1
-        node, depth = stack[top, 0], stack[top, 1]
-        start, stop = U(stack[top, 2]), U(stack[top, 3])
-
-
-@njit(cache=True, nogil=True)
-def predict_forest(nodes, values, first, x):
-    """Mean over the trees at `x` (m, d) float32, as float64 (m,)."""
-    trees = first.size - 1
-    total = np.zeros(x.shape[0])
-    if x.shape[0] >= TOGETHER:
-        keys, row, none, _ = new_rows(x, False, False)
-        stack = np.empty((x.shape[0] + 1, 4), np.int64)
-        for t in range(trees):
-            send_down(
-                keys, row, none, U(x.shape[1]), nodes, values, first[t], stack, total
-            )
-    else:
-        walk = np.empty(x.shape, np.int32)
-        for i in range(x.shape[0]):
-            for f in range(x.shape[1]):
-                walk[i, f] = key_of(x[i, f])
-        for t in range(trees):
-            for i in range(x.shape[0]):
-                node = first[t]
-                while nodes[node].feature >= 0:
-                    right = walk[i, nodes[node].feature] > nodes[node].cut
-                    node = np.int64(nodes[node].child) + right
-                total[i] += values[nodes[node].child]
-    return total / trees

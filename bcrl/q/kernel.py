@@ -1,4 +1,4 @@
-"""Compiled parts of the forest: keys, random cuts, sums over rows, moving rows.
+"""Compiled parts of the forest: keys, random cuts, the choice of a split.
 
 Three representations make the loops fast and the results exact:
 
@@ -6,14 +6,12 @@ Three representations make the loops fast and the results exact:
   that comparisons and minima are integer operations, which vectorise;
 * targets are **fixed-point** int64, so that sums are exact and independent of the order
   of rows, of the vector width and of the machine (sums of floats are none of these);
-* the rows of a node lie side by side in every buffer: a split moves them from one
-  buffer into the other, so that memory is read in sequence.
+* the rows of a node lie side by side (`bcrl.q.rows`).
 
 Because sums are exact, a row of multiplicity 3 and three equal rows give the same tree
 bit for bit, and so does any order of the rows.
 
-A buffer holds three **planes**: the rows as given, and two that the levels of a tree
-use in turn. Indices are unsigned because numba checks signed ones for being negative.
+Indices are unsigned because numba checks signed ones for being negative.
 """
 
 from __future__ import annotations
@@ -39,20 +37,27 @@ GOLDEN, LOW32 = U(0x9E3779B97F4A7C15), U(0xFFFFFFFF)
 SIGN, REST = np.int32(31), np.int32(0x7FFFFFFF)
 
 
-@njit
+#: Functions that neither make nor keep arrays need no counting of references to them,
+#: which costs more than the work in a small node does.
+bare = njit(_nrt=False)
+#: The same, woven into the caller: passing arrays costs as much again.
+woven = njit(_nrt=False, inline="always")
+
+
+@woven
 def key_of(value):
     """The int32 that orders like the float32 `value`; −0 is taken as +0."""
     bits = np.float32(value + np.float32(0.0)).view(np.int32)
     return np.int32(bits ^ ((bits >> SIGN) & REST))
 
 
-@njit
+@woven
 def value_of(key):
     """The float32 that the int32 `key` stands for."""
     return np.int32(key ^ ((key >> SIGN) & REST)).view(np.float32)
 
 
-@njit
+@woven
 def mix(state):
     """Output function of splitmix64 (Steele, Lea and Flood 2014), uint64 to uint64."""
     z = (state ^ (state >> U(30))) * U(0xBF58476D1CE4E5B9)
@@ -60,7 +65,7 @@ def mix(state):
     return z ^ (z >> U(31))
 
 
-@njit
+@woven
 def draw_cut(low, high, bits):
     """Key of a threshold uniform on [low, high), given 32 random bits.
 
@@ -84,33 +89,7 @@ class Split(NamedTuple):
     total: np.int64
 
 
-@njit
-def new_rows(x, carries, weighted):
-    """Buffers whose first plane holds `x` (size, d); targets and weights to be filled.
-
-    keys: (3·d·size,) int32, within a plane feature by feature; row: (3·size,) uint32,
-    the index the row was given under; target: (3·size,) int64, or empty for query rows;
-    weight: (3·size,) int64 multiplicities, or empty if all are 1.
-    """
-    size, d = U(x.shape[0]), U(x.shape[1])
-    keys = np.empty(U(3) * d * size, np.int32)
-    row = np.empty(U(3) * size, np.uint32)
-    for i in range(size):
-        row[i] = i
-        for f in range(d):
-            keys[f * size + i] = key_of(x[i, f])
-    target = np.empty(U(3) * size if carries else ZERO, np.int64)
-    weight = np.empty(U(3) * size if weighted else ZERO, np.int64)
-    return keys, row, target, weight
-
-
-@njit
-def plane(depth):
-    """The plane that a node of this depth lies in."""
-    return ZERO if depth == 0 else U(1 + (depth & 1))
-
-
-@njit
+@woven
 def is_pure(target, weight, start, stop, total_weight, unit):
     """Whether the variance of the targets at `start:stop` is at most PURE.
 
@@ -130,7 +109,7 @@ def is_pure(target, weight, start, stop, total_weight, unit):
     return square - mean * mean <= PURE
 
 
-@njit
+@woven
 def gain(low, high, weight, total, node_weight, node_total, min_leaf):
     """Variance reduction of a split up to a factor common to the node; −1: not allowed.
 
@@ -147,7 +126,7 @@ def gain(low, high, weight, total, node_weight, node_total, min_leaf):
     return gap * gap / (np.float64(weight) * right)
 
 
-@njit
+@woven
 def choose_two(
     keys, target, weight, size, base, here, start, stop, w_node, s_node, min_leaf, state
 ):
@@ -196,17 +175,30 @@ def choose_two(
     return Split(0, cut0, w0, s0), state
 
 
-@njit
+@bare
 def choose(
-    keys, target, weight, size, base, here, start, stop, w_node, s_node, min_leaf, state,
-    max_features, order,
+    keys,
+    target,
+    weight,
+    size,
+    base,
+    here,
+    start,
+    stop,
+    w_node,
+    s_node,
+    min_leaf,
+    state,
+    max_features,
+    order,
 ):
     """The best of the tried features by variance reduction, each cut at random.
 
     Features are visited in random order: ties between them fall either way. As in
     scikit-learn a constant feature counts as tried, but at least one other is.
     base, here: where the node's plane begins in keys, and in everything else; w_node,
-    s_node: weight and sum of the node; order: (d,) a permutation of the features, shuffled further.
+    s_node: weight and sum of the node; order: (d,) a permutation
+    of the features, shuffled further.
     """
     best, split = -1.0, Split(-1, np.int32(0), np.int64(0), np.int64(0))
     left = order.size
@@ -241,81 +233,3 @@ def choose(
         if score > best:
             best, split = score, Split(feature, cut, w, s)
     return split, state
-
-
-@njit
-def move(keys, row, target, weight, size, d, depth, start, stop, feature, cut):
-    """Move a node's rows to its children's plane, left ones first; where these end."""
-    a, b = plane(depth) * size, plane(depth + 1) * size
-    base, out = a * d, b * d
-    by = base + U(feature) * size
-    left, right = start, stop - ONE
-    if d == TWO and target.size == 0:
-        for i in range(start, stop):
-            goes = U(keys[by + i] <= cut)
-            p = left if goes else right
-            keys[out + p] = keys[base + i]
-            keys[out + size + p] = keys[base + size + i]
-            row[b + p] = row[a + i]
-            left += goes
-            right -= ONE - goes
-    elif d == TWO:
-        for i in range(start, stop):
-            goes = U(keys[by + i] <= cut)
-            p = left if goes else right
-            keys[out + p] = keys[base + i]
-            keys[out + size + p] = keys[base + size + i]
-            row[b + p] = row[a + i]
-            target[b + p] = target[a + i]
-            if weight.size > 0:
-                weight[b + p] = weight[a + i]
-            left += goes
-            right -= ONE - goes
-    else:
-        for i in range(start, stop):
-            goes = U(keys[by + i] <= cut)
-            p = left if goes else right
-            for f in range(d):
-                keys[out + f * size + p] = keys[base + f * size + i]
-            row[b + p] = row[a + i]
-            if target.size > 0:
-                target[b + p] = target[a + i]
-            if weight.size > 0:
-                weight[b + p] = weight[a + i]
-            left += goes
-            right -= ONE - goes
-    return left
-
-
-@njit
-def move_queries(keys, row, size, d, depth, start, stop, feature, cut):
-    a, b = plane(depth) * size, plane(depth + 1) * size
-    base, out = a * d, b * d
-    by = base + U(feature) * size
-    left, right = start, stop - ONE
-    if d == TWO:
-        for i in range(start, stop):
-            goes = U(keys[by + i] <= cut)
-            p = left if goes else right
-            keys[out + p] = keys[base + i]
-            keys[out + size + p] = keys[base + size + i]
-            row[b + p] = row[a + i]
-            left += goes
-            right -= ONE - goes
-    else:
-        for i in range(start, stop):
-            goes = U(keys[by + i] <= cut)
-            p = left if goes else right
-            for f in range(d):
-                keys[out + f * size + p] = keys[base + f * size + i]
-            row[b + p] = row[a + i]
-            left += goes
-            right -= ONE - goes
-    return left
-
-
-@njit
-def add_value(row, start, stop, value, total):
-    """Add a leaf's value to `total` at the rows that lie in it."""
-    for i in range(start, stop):
-        total[row[i]] += value

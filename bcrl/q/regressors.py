@@ -57,7 +57,7 @@ def _at_least(key: str, value: int, least: int) -> None:
 
 
 @dataclass(frozen=True)
-class ExtraTrees:
+class ForestRegressor:
     """Extremely randomised trees, compiled (Geurts et al. 2006; Ernst et al. 2005)."""
 
     trees: int = 50
@@ -92,7 +92,7 @@ class ExtraTrees:
 
 
 @dataclass(frozen=True)
-class SklearnExtraTrees(ExtraTrees):
+class SklearnForestRegressor(ForestRegressor):
     """scikit-learn's own forest; multiplicities become repeated rows."""
 
     def fit(self, problems: Sequence[Problem], keep: bool, threads: int) -> list[Fit]:
@@ -142,8 +142,8 @@ class Tabular:
 
 
 REGRESSORS = {
-    "forest": ExtraTrees,
-    "sklearn_forest": SklearnExtraTrees,
+    "forest": ForestRegressor,
+    "sklearn_forest": SklearnForestRegressor,
     "tabular": Tabular,
 }
 

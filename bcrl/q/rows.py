@@ -1,0 +1,108 @@
+"""Compiled buffers that keep the rows of a tree's node side by side.
+
+A buffer holds three **planes**: the rows as given, and two that the levels of a tree
+use in turn. A split moves a node's rows from one plane into the next, without a branch
+and so that memory is read in sequence. Two features have loops of their own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from bcrl.q.kernel import ONE, TWO, ZERO, U, key_of, woven
+
+
+@njit
+def new_rows(x, carries, weighted):
+    """Buffers whose first plane holds `x` (size, d); targets and weights to be filled.
+
+    keys: (3·d·size,) int32, within a plane feature by feature; row: (3·size,) uint32,
+    the index the row was given under; target: (3·size,) int64, or empty for query rows;
+    weight: (3·size,) int64 multiplicities, or empty if all are 1.
+    """
+    size, d = U(x.shape[0]), U(x.shape[1])
+    keys = np.empty(U(3) * d * size, np.int32)
+    row = np.empty(U(3) * size, np.uint32)
+    for i in range(size):
+        row[i] = i
+        for f in range(d):
+            keys[f * size + i] = key_of(x[i, f])
+    target = np.empty(U(3) * size if carries else ZERO, np.int64)
+    weight = np.empty(U(3) * size if weighted else ZERO, np.int64)
+    return keys, row, target, weight
+
+
+@woven
+def plane(depth):
+    """The plane that a node of this depth lies in."""
+    return ZERO if depth == 0 else U(1 + (depth & 1))
+
+
+@woven
+def move_rows(keys, row, target, weight, size, d, depth, start, stop, feature, cut):
+    """Move a node's rows to its children's plane, left ones first; where these end."""
+    a, b = plane(depth) * size, plane(depth + 1) * size
+    base, out = a * d, b * d
+    by = base + U(feature) * size
+    left, right = start, stop - ONE
+    if d == TWO:
+        for i in range(start, stop):
+            goes = U(keys[by + i] <= cut)
+            p = left if goes else right
+            keys[out + p] = keys[base + i]
+            keys[out + size + p] = keys[base + size + i]
+            row[b + p] = row[a + i]
+            target[b + p] = target[a + i]
+            if weight.size > 0:
+                weight[b + p] = weight[a + i]
+            left += goes
+            right -= ONE - goes
+    else:
+        for i in range(start, stop):
+            goes = U(keys[by + i] <= cut)
+            p = left if goes else right
+            for f in range(d):
+                keys[out + f * size + p] = keys[base + f * size + i]
+            row[b + p] = row[a + i]
+            target[b + p] = target[a + i]
+            if weight.size > 0:
+                weight[b + p] = weight[a + i]
+            left += goes
+            right -= ONE - goes
+    return left
+
+
+@woven
+def move_queries(keys, row, size, d, depth, start, stop, feature, cut):
+    """`move_rows` for query rows, which have neither target nor weight."""
+    a, b = plane(depth) * size, plane(depth + 1) * size
+    base, out = a * d, b * d
+    by = base + U(feature) * size
+    left, right = start, stop - ONE
+    if d == TWO:
+        for i in range(start, stop):
+            goes = U(keys[by + i] <= cut)
+            p = left if goes else right
+            keys[out + p] = keys[base + i]
+            keys[out + size + p] = keys[base + size + i]
+            row[b + p] = row[a + i]
+            left += goes
+            right -= ONE - goes
+    else:
+        for i in range(start, stop):
+            goes = U(keys[by + i] <= cut)
+            p = left if goes else right
+            for f in range(d):
+                keys[out + f * size + p] = keys[base + f * size + i]
+            row[b + p] = row[a + i]
+            left += goes
+            right -= ONE - goes
+    return left
+
+
+@woven
+def add_value(row, start, stop, value, total):
+    """Add a leaf's value to `total` at the rows that lie in it."""
+    for i in range(start, stop):
+        total[row[i]] += value
