@@ -33,6 +33,7 @@ Plain = dict[str, Any]  # a resolved config: dicts, lists and scalars
 class Plan:
     """Everything a run needs, checked; holds no Hydra object."""
 
+    env: str  # the choice's name, "maze"; several may use one environment
     variant: str  # "BC-FQI"
     tag: str | None
     stages: tuple[Stage, ...]
@@ -63,8 +64,7 @@ class Plan:
     @property
     def directory(self) -> Path:
         """Where this run's results go."""
-        config = self.config
-        return self.root / config["scale"]["name"] / config["env"]["name"] / self.name
+        return self.root / self.config["scale"]["name"] / self.env / self.name
 
     @property
     def iterations(self) -> int:
@@ -95,11 +95,12 @@ def flat(config: Plain, prefix: str = "") -> Plain:
     return out
 
 
-def plan(config: Plain, variant_defaults: Plain) -> Plan:
+def plan(config: Plain, variant_defaults: Plain, env: str) -> Plan:
     """The checked plan of a resolved config; ConfigError says what can't be.
 
     `variant_defaults` is the same choice of groups without any value overridden: where
-    the config departs from it, the results get a directory of their own.
+    the config departs from it, the results get a directory of their own, below the
+    name of the `env` choice.
     """
     _check_outputs(config)
     tasks, metrics = _tasks(config["env"])
@@ -122,6 +123,7 @@ def plan(config: Plain, variant_defaults: Plain) -> Plan:
     prefix = "B" * boosting + "C" * curriculum
     changed = differences(config, variant_defaults)
     return Plan(
+        env=env,
         variant=f"{prefix}-{settings.name.upper()}"
         if prefix
         else settings.name.upper(),
@@ -236,9 +238,3 @@ def _stages(
 
 def _capped(value: int, cap: int | None) -> int:
     return value if cap is None else min(value, cap)
-
-
-def describe(p: Plan) -> str:
-    """One line for people: what will run."""
-    env, n = p.config["env"]["name"], len(p.seeds)
-    return f"{env} {p.name}: {n} seed{'s' * (n > 1)}, {p.iterations} iterations each"

@@ -103,7 +103,7 @@ def write_seed(
         "status": "complete",
         "seed": seed,
         "scale": config["scale"]["name"],
-        "env": config["env"]["name"],
+        "env": plan.env,
         "variant": plan.variant,
         "tag": plan.tag,
         **facts,

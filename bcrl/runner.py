@@ -25,7 +25,7 @@ Seeds = tuple[int, ...]
 def run(plan: Plan) -> None:
     """Compute every seed of the plan that is not complete yet, and record it."""
     pending = records.open_directory(plan)
-    name = f"{plan.config['env']['name']} {plan.name}"
+    name = f"{plan.env} {plan.name}"
     skipped = len(plan.seeds) - len(pending)
     if skipped and plan.config["progress"] != "none":
         print(f"{name}: {skipped} of {len(plan.seeds)} seeds complete", file=sys.stderr)

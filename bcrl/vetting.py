@@ -60,7 +60,8 @@ def plan(
     """The plan of one composed config, made with these group choices."""
     variant = tuple(f"{group}={choices[group]}" for group in VARIANT_GROUPS)
     extra = tuple(f for f in folders if Path(f) != CONF)
-    return compose.plan(_plain(composed), _plain(_compose(CONFIG_NAME, variant, extra)))
+    defaults = _plain(_compose(CONFIG_NAME, variant, extra))
+    return compose.plan(_plain(composed), defaults, choices["env"])
 
 
 def _plain(composed: DictConfig) -> Plain:

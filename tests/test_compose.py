@@ -138,3 +138,21 @@ def test_every_experiment_composes_at_every_scale_with_every_option(experiment):
                 "fig2_released",  # its maze leaves the lattice
             )
             assert (ended == "refused") == refused, (scale, regressor, ended)
+
+
+def test_a_users_folder_adds_options_of_its_own(tmp_path):
+    (tmp_path / "experiment").mkdir()
+    text = "# @package _global_\ndefaults:\n  - override /env: maze\ntag: mine\n"
+    (tmp_path / "experiment" / "mine.yaml").write_text(text)
+    (tmp_path / "env").mkdir()
+    shipped = (vetting.CONF / "env" / "maze.yaml").read_text()
+    low = shipped.replace("0.85, 0.95]", "0.85, 0.9]")
+    (tmp_path / "env" / "low_maze.yaml").write_text(low)
+    (own,) = plans("experiment=mine", config_dir=str(tmp_path))
+    assert own.name == "FQI@mine"
+    (tmp_path / "budget").mkdir()
+    budget = (vetting.CONF / "budget" / "maze_fqi.yaml").read_text()
+    (tmp_path / "budget" / "low_maze_fqi.yaml").write_text(budget)
+    (low_maze,) = plans("env=low_maze", "curriculum=on", config_dir=str(tmp_path))
+    assert low_maze.directory == Path("runs/quick/low_maze/C-FQI")
+    assert low_maze.target.height == 0.9 and low_maze.stages[-1].iterations == 50

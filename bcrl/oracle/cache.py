@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
-import uuid
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from bcrl.errors import BcrlError
+from bcrl.files import write_text
 
 SEAL = b"# sha256 "
 
@@ -62,19 +65,7 @@ def _read(path: Path, shape: tuple[int, int]) -> NDArray[np.int64] | None:
 
 
 def _write(path: Path, table: NDArray[np.int64]) -> None:
-    body = "".join(",".join(map(str, row)) + "\n" for row in table.tolist()).encode()
-    seal = SEAL + hashlib.sha256(body).hexdigest().encode() + b"\n"
-    draft = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draft.write_bytes(body + seal)
-        os.replace(draft, path)
-    except OSError:
-        _discard(draft)
-
-
-def _discard(draft: Path) -> None:
-    try:
-        draft.unlink(missing_ok=True)
-    except OSError:
-        return
+    body = "".join(",".join(map(str, row)) + "\n" for row in table.tolist())
+    seal = SEAL.decode() + hashlib.sha256(body.encode()).hexdigest() + "\n"
+    with contextlib.suppress(BcrlError):
+        write_text(path, body + seal)
