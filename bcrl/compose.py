@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import re
@@ -13,6 +14,8 @@ from typing import Any
 from bcrl import probes
 from bcrl.config import (
     OUTPUT_KEYS,
+    Choice,
+    Config,
     FQISettings,
     at_least,
     construct,
@@ -21,7 +24,7 @@ from bcrl.config import (
 )
 from bcrl.curriculum import CURRICULA
 from bcrl.envs import Env, env_class, is_finite
-from bcrl.errors import ConfigError
+from bcrl.errors import ConfigError, did_you_mean
 from bcrl.learners.fqi import Stage
 from bcrl.q.regressors import Regressor, regressor_class
 from bcrl.transfer import Transfer, boost, warm_start
@@ -74,14 +77,17 @@ class Plan:
 
 def identity(config: Plain) -> Plain:
     """The part of a config that decides numbers."""
-    return {k: v for k, v in config.items() if k not in OUTPUT_KEYS}
+    kept = {k: v for k, v in config.items() if k not in OUTPUT_KEYS}
+    env = {k: v for k, v in kept["env"].items() if k != "paper_seeds"}
+    return kept | {"env": env}
 
 
 def differences(config: Plain, other: Plain) -> dict[str, tuple[Any, Any]]:
     """Dotted keys at which two configs' identities differ, with both values."""
     a, b = flat(identity(config)), flat(identity(other))
     keys = sorted(a.keys() | b.keys())
-    return {k: (a.get(k), b.get(k)) for k in keys if a.get(k) != b.get(k)}
+    both = {k: (a.get(k, "absent"), b.get(k, "absent")) for k in keys}
+    return {k: (x, y) for k, (x, y) in both.items() if x != y}
 
 
 def flat(config: Plain, prefix: str = "") -> Plain:
@@ -109,7 +115,7 @@ def plan(config: Plain, variant_defaults: Plain, env: str) -> Plan:
     one_of("curriculum.name", config["curriculum"]["name"], list(CURRICULA))
     one_of("boosting.name", config["boosting"]["name"], ["on", "off"])
     one_of("transfer.name", config["transfer"]["name"], ["none"])
-    curriculum = config["curriculum"]["name"] == "on"
+    curriculum = config["curriculum"]["name"] != "off"
     boosting = config["boosting"]["name"] == "on"
     if len(tasks) == 1 and (curriculum or boosting):
         key = "curriculum" if curriculum else "boosting"
@@ -150,6 +156,12 @@ def _short_hash(changed: Mapping[str, tuple[Any, Any]]) -> str:
 
 def _check_outputs(config: Plain) -> None:
     seeds, scale = config["seeds"], config["scale"]
+    known = [f.name for f in dataclasses.fields(Config)]
+    for key, value in config.items():
+        if key not in known:
+            raise ConfigError(key, value, f"unknown key; {did_you_mean(key, known)}")
+    for group in ("curriculum", "boosting", "transfer"):
+        construct(group, Choice, config[group])
     at_least("seeds.first", seeds["first"], 0)
     at_least("seeds.count", seeds["count"], 1)
     at_least("seeds.lockstep", seeds["lockstep"], 1)
@@ -170,6 +182,10 @@ def _tasks(section: Plain) -> tuple[list[Env], tuple[str, ...]]:
     if not isinstance(section, dict) or not isinstance(section.get("name"), str):
         raise ConfigError("env", section, "must have a name")
     cls = env_class(section["name"])
+    overlap = sorted(section.keys() & (section.get("tasks") or {}).keys())
+    if overlap:
+        key = f"env.{overlap[0]}"
+        raise ConfigError(key, section[overlap[0]], f"env.tasks.{overlap[0]} decides")
     constants = {
         k: v
         for k, v in section.items()

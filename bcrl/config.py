@@ -124,10 +124,8 @@ def per_task(
     key: str, value: Any, n_tasks: int, kind: type, least: float, most: float = math.inf
 ) -> list:
     """A budget's value for each task, from one value or a list of `n_tasks`."""
-    values = list(value) if isinstance(value, Sequence | tuple) else [value] * n_tasks
-    if isinstance(value, str):
-        values = [value]
-    elif len(values) != n_tasks:
+    values = value if isinstance(value, list) else [value] * n_tasks
+    if len(values) != n_tasks:
         raise ConfigError(
             key, value, f"has {len(values)} entries, but there are {n_tasks} tasks"
         )

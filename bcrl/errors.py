@@ -15,6 +15,10 @@ class ConfigError(BcrlError):
 
     def __init__(self, key: str, value: object, allowed: str) -> None:
         super().__init__(f"{key}={value}: {allowed}")
+        self._arguments = (key, value, allowed)
+
+    def __reduce__(self) -> tuple:
+        return type(self), self._arguments  # so that it can leave a worker process
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

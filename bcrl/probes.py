@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bcrl import oracle
 from bcrl.envs import Env
-from bcrl.errors import ConfigError, did_you_mean
+from bcrl.errors import BcrlError, ConfigError, did_you_mean
 from bcrl.learners.fqi import Snapshot
 from bcrl.rollout import Episodes, draws, rollout
 from bcrl.streams import stream
@@ -64,7 +64,7 @@ METRICS: dict[str, Callable[[View], float]] = {
 def check(metrics: Sequence[str], target: Env) -> None:
     """Raise ConfigError for a metric that is unknown or that `target` can't have."""
     for name in metrics:
-        if name not in METRICS:
+        if not isinstance(name, str) or name not in METRICS:
             raise ConfigError("env.metrics", name, did_you_mean(str(name), METRICS))
         if name.startswith("q_error") and not oracle.available(target):
             raise ConfigError("env.metrics", name, f"no Q* of {target.name} is known")
@@ -143,7 +143,10 @@ def _layout(env: Env, target: Env) -> tuple[NDArray, NDArray, NDArray]:
     states = probed_states(target)
 
     def rows(of: NDArray) -> NDArray[np.intp]:
-        return (of[:, None] == states[None]).all(-1).argmax(1)
+        match = (of[:, None] == states[None]).all(-1)
+        if not match.any(1).all():
+            raise BcrlError(f"{env}: its evaluation states are not the target's")
+        return match.argmax(1)
 
     known = oracle.reference(env)
     start = rows(env.evaluation_states())

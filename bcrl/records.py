@@ -8,7 +8,6 @@ import platform
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,12 +16,13 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from bcrl import __version__
 from bcrl.compose import Plain, Plan, differences, identity
 from bcrl.errors import BcrlError
 from bcrl.files import write_atomically, write_text
 
 SCHEMA = 1  # raised when a file's meaning changes
-LIBRARIES = ("boosted-curriculum-rl", "hydra-core", "numpy", "numba", "scikit-learn")
+LIBRARIES = ("hydra-core", "numpy", "numba", "scikit-learn")
 
 
 def check_directory(plan: Plan) -> None:
@@ -107,7 +107,6 @@ def write_seed(
         "variant": plan.variant,
         "tag": plan.tag,
         **facts,
-        **_provenance(),
         "config": config,
     }
     write_atomically(
@@ -118,12 +117,12 @@ def write_seed(
     write_text(seed_path(directory, seed, "json"), dump)
 
 
-@cache
-def _provenance() -> dict[str, Any]:
+def provenance() -> dict[str, Any]:
     """Versions, git revision and machine."""
     return {
         "command": " ".join(sys.argv),
         "versions": {
+            "bcrl": __version__,
             "python": platform.python_version(),
             **{name: version(name) for name in LIBRARIES},
         },

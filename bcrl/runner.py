@@ -6,14 +6,15 @@ import multiprocessing
 import os
 import queue
 import resource
+import signal
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, wait
 
 import numpy as np
 
-from bcrl import records
+from bcrl import oracle, records
 from bcrl.compose import Plan
 from bcrl.learners.fqi import FQI
 from bcrl.probes import Probe
@@ -31,6 +32,9 @@ def run(plan: Plan) -> None:
         print(f"{name}: {skipped} of {len(plan.seeds)} seeds complete", file=sys.stderr)
     if not pending:
         return
+    if any(metric.startswith("q_error") for metric in plan.metrics):
+        for task in dict.fromkeys((*plan.tasks[-1:], *(s.env for s in plan.stages))):
+            oracle.reference(task)  # searched for once, here, and kept on disk
     progress = Progress(name, pending, plan.iterations, plan.config["progress"])
     try:
         _train(plan, _groups(plan, pending), progress.tick)
@@ -48,23 +52,39 @@ def _groups(plan: Plan, seeds: list[int]) -> list[Seeds]:
 
 def _train(plan: Plan, groups: list[Seeds], tick: Callable[[Tick], None]) -> None:
     workers = min(plan.config["workers"], len(groups))
+    threads = plan.config["threads"] or max(1, _cores() // workers)
+    origin = records.provenance()  # of the code that starts, not of what it becomes
     if workers == 1:
         for group in groups:
-            train_group(plan, group, _threads(plan), tick)
+            train_group(plan, group, threads, origin, tick)
         return
     context = multiprocessing.get_context("spawn")
     with context.Manager() as manager:
         ticks = manager.Queue()
-        with ProcessPoolExecutor(workers, context) as pool:
+        pool = ProcessPoolExecutor(workers, context, initializer=_leave_interrupts)
+        try:
             jobs = [
-                pool.submit(train_group, plan, group, _threads(plan), ticks.put)
+                pool.submit(train_group, plan, group, threads, origin, ticks.put)
                 for group in groups
             ]
-            while not all(job.done() for job in jobs):
+            waiting = set(jobs)
+            while waiting:
                 _drain(ticks, tick)
-            for job in as_completed(jobs):
-                job.result()
+                done, waiting = wait(waiting, timeout=0)
+                for job in done:
+                    job.result()
             _drain(ticks, tick)
+        except BaseException:  # a failure or Ctrl-C ends all workers at once
+            pool.shutdown(wait=False, cancel_futures=True)
+            for worker in multiprocessing.active_children():
+                worker.terminate()
+            raise
+        pool.shutdown()
+
+
+def _leave_interrupts() -> None:
+    """Ctrl-C reaches every process of a terminal; the parent alone deals with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _drain(ticks: queue.Queue, tick: Callable[[Tick], None]) -> None:
@@ -76,15 +96,24 @@ def _drain(ticks: queue.Queue, tick: Callable[[Tick], None]) -> None:
         return
 
 
-def _threads(plan: Plan) -> int:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-    return plan.config["threads"] or max(1, cores // plan.config["workers"])
+def _cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def train_group(
-    plan: Plan, seeds: Seeds, threads: int, tick: Callable[[Tick], None]
+    plan: Plan,
+    seeds: Seeds,
+    threads: int,
+    origin: dict,
+    tick: Callable[[Tick], None],
 ) -> None:
-    """Train a group of seeds in lockstep and write each seed's files."""
+    """Train a group of seeds in lockstep and write each seed's files.
+
+    origin: which code and machine, as `records.provenance` says.
+    """
     wall, cpu = time.perf_counter(), time.process_time()
     learner = FQI(
         seeds,
@@ -123,4 +152,4 @@ def train_group(
         if hasattr(plan.target, "walls"):  # what a figure needs to draw the tasks
             arrays["walls"] = np.stack([task.walls for task in plan.tasks])
             arrays["goal"] = plan.target.goal
-        records.write_seed(plan, seed, rows[s], arrays, facts)
+        records.write_seed(plan, seed, rows[s], arrays, facts | origin)

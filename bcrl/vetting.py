@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -44,7 +44,8 @@ def plans(arguments: Namespace) -> list[Plan]:
     searchpath = [o for o in parsed if o.key_or_group == "hydra.searchpath"]
     parsed = [o for o in parsed if o not in searchpath]
     for override in searchpath:
-        folders += tuple(str(p).removeprefix("file://") for p in override.value())
+        folders += _folders(override.value())
+    _refuse_nonsense(parsed, folders, arguments)
     jobs = _jobs(name, parsed, bool(arguments.multirun), folders)
     planned = []
     for job in jobs:
@@ -54,14 +55,61 @@ def plans(arguments: Namespace) -> list[Plan]:
     return planned
 
 
+def _folders(searchpath: object) -> Folders:
+    """The folders that a `hydra.searchpath` override names."""
+    entries = searchpath if isinstance(searchpath, list) else [searchpath]
+    found = tuple(str(entry).removeprefix("file://") for entry in entries)
+    for folder in found:
+        if not Path(folder).is_dir():
+            raise BcrlError(f"hydra.searchpath: there is no folder {folder}")
+    return found
+
+
+def _refuse_nonsense(
+    overrides: Sequence[Override], folders: Folders, arguments: Namespace
+) -> None:
+    """Raise BcrlError for what Hydra would take without a word, or trip over."""
+    for override in overrides:
+        key, value = override.key_or_group, override.value()
+        if key == "experiment" and (
+            isinstance(value, list) or override.is_sweep_override()
+        ):
+            raise BcrlError("experiment: one at a time, each is a sweep of its own")
+        places = [Path(folder, "budget") for folder in (CONF, *folders)]
+        known = {path.stem for place in places for path in place.glob("*.yaml")}
+        if key == "budget" and value not in known:
+            raise BcrlError(f"budget={value}: {did_you_mean(str(value), known)}")
+    if arguments.multirun and getattr(arguments, "cfg", None):
+        raise BcrlError("--cfg shows one composition; drop -m and the sweep")
+
+
 def plan(
     composed: DictConfig, choices: Mapping[str, str], folders: Sequence[str]
 ) -> Plan:
     """The plan of one composed config, made with these group choices."""
-    variant = tuple(f"{group}={choices[group]}" for group in VARIANT_GROUPS)
+    for group in VARIANT_GROUPS:
+        if choices.get(group) is None:
+            raise BcrlError(f"{group}: every run needs a choice of it")
     extra = tuple(f for f in folders if Path(f) != CONF)
-    defaults = _plain(_compose(CONFIG_NAME, variant, extra))
-    return compose.plan(_plain(composed), defaults, choices["env"])
+    config = _plain(composed)
+    variant = (f"env={choices['env']}", *_usual(config, choices))
+    return compose.plan(
+        config, _plain(_compose(CONFIG_NAME, variant, extra)), choices["env"]
+    )
+
+
+def _usual(config: Plain, choices: Mapping[str, str]) -> Iterator[str]:
+    """The shipped choices that this config is a case of, by its components' names.
+
+    A user's option `big` that is named fqi is thus compared with our fqi, and a
+    curriculum of any other name with `curriculum=on`.
+    """
+    for group in VARIANT_GROUPS[1:]:
+        name = config[group].get("name")
+        if group in ("curriculum", "boosting"):
+            name = "off" if name == "off" else "on"
+        shipped = (CONF / group / f"{name}.yaml").exists()
+        yield f"{group}={name if shipped else choices[group]}"
 
 
 def _plain(composed: DictConfig) -> Plain:
@@ -86,14 +134,13 @@ def _jobs(
     name: str, overrides: list[Override], multirun: bool, folders: Folders
 ) -> list[list[str]]:
     """Each job's overrides: the product of what the command line and config sweep."""
-    fixed = [o.input_line for o in overrides if not o.is_sweep_override()]
-    firsts = [job[0] for job in zip(*_product(overrides)[:1], strict=True)]
-    first = _compose(name, tuple(firsts or fixed), folders).hydra
+    jobs = _product(overrides)
+    first = _compose(name, tuple(jobs[0]), folders).hydra
     if not multirun and first.mode != RunMode.MULTIRUN:
         swept = [o.key_or_group for o in overrides if o.is_sweep_override()]
         if swept:
             raise BcrlError(f"{swept[0]}: several values are a sweep; add -m")
-        return [fixed]
+        return jobs
     params = [f"{k}={v}" for k, v in (first.sweeper.get("params") or {}).items()]
     return _product(_parse(params) + overrides)
 

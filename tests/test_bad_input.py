@@ -62,6 +62,18 @@ BAD = {
         ["algorithm.dataset=shared", "epsilon must be 1"],
     ),
     "sweep without -m": ([MAZE, "curriculum=on,off"], ["curriculum", "-m"]),
+    "two experiments": (["experiment=[fig1,fig2]"], ["experiment", "one at a time"]),
+    "swept experiments": (["experiment=fig1,fig2"], ["experiment", "one at a time"]),
+    "unknown budget": ([MAZE, "budget=maze_fqy"], ["budget=maze_fqy", "maze_fqi"]),
+    "added key on top": ([MAZE, "+iterations=3"], ["iterations=3", "unknown key"]),
+    "a task's key twice": ([MAZE, "+env.height=0.3"], ["env.height=0.3", "env.tasks"]),
+    "added to a choice": (
+        [MAZE, "+curriculum.foo=null"],
+        ["curriculum.foo", "unknown"],
+    ),
+    "deleted group": ([MAZE, "~transfer"], ["transfer", "needs a choice"]),
+    "metric no name": ([MAZE, "env.metrics=[[return]]"], ["env.metrics"]),
+    "no searchpath": ([MAZE, "hydra.searchpath=[/no/where]"], ["/no/where"]),
     "unspeakable tag": ([MAZE, "tag=a/b"], ["tag=a/b", "letters"]),
     "no override": ([MAZE, "curriculum on"], ["KEY=VALUE"]),
 }

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from bcrl import vetting
+from bcrl.curriculum import CURRICULA
 from bcrl.errors import BcrlError
 from bcrl.transfer import boost, warm_start
 from tests.conftest import plan, plans
@@ -83,6 +84,21 @@ def test_a_composition_of_ones_own_gets_a_directory_of_its_own():
     # A value that is the default anyway makes no difference.
     assert plan("env=maze", "algorithm.regressor.trees=50").name == "FQI"
     assert plan("env=maze", "budget=maze_fqi").name == "FQI"
+
+
+def test_options_of_ones_own_never_pass_for_the_shipped_ones(tmp_path, monkeypatch):
+    (tmp_path / "algorithm").mkdir()
+    shipped = (vetting.CONF / "algorithm" / "fqi.yaml").read_text()
+    big = shipped.replace("- regressor: forest", "- regressor: sklearn_forest")
+    (tmp_path / "algorithm" / "big.yaml").write_text(big)
+    (own,) = plans("env=maze", "algorithm=big", config_dir=str(tmp_path))
+    assert own.name.startswith("FQI@")
+    monkeypatch.setitem(CURRICULA, "reverse", lambda n: [n - 1 - i for i in range(n)])
+    (tmp_path / "curriculum").mkdir()
+    (tmp_path / "curriculum" / "reverse.yaml").write_text("name: reverse\n")
+    (own,) = plans("env=maze", "curriculum=reverse", config_dir=str(tmp_path))
+    assert own.name.startswith("C-FQI@")
+    assert [stage.task for stage in own.stages] == list(range(10, 0, -1))
 
 
 def test_an_experiment_is_its_figures_sweep():

@@ -106,15 +106,46 @@ def test_a_kept_dataset_is_not_collected_again():
     assert [i for i, _ in seen] == [1, 2, 3, 4]
 
 
-def test_released_options_share_data_and_fix_the_trees_randomness():
-    own = FQI((0, 1), ForestRegressor(trees=2), warm_start)
-    shared = FQI((0, 1), ForestRegressor(trees=2), warm_start, shared_data=True)
-    fixed = FQI((0, 1), ForestRegressor(trees=2), warm_start, fixed_trees=True)
-    (stage,) = stages([OpenCorridor()], iterations=2, new_data=(True,))
-    runs = [list(x.run([stage], Corridor().states())) for x in (own, shared, fixed)]
-    assert own._datasets[0] is not own._datasets[1]
-    assert shared._datasets[0] is shared._datasets[1]
-    assert all(len(run) == 2 for run in runs)
+class Recorder(Tabular):
+    """Notes the first draw of every fit, by iteration."""
+
+    def __init__(self):
+        object.__setattr__(self, "draws", [])
+
+    def fit(self, problems, keep, threads):
+        self.draws.append([p.rng.integers(2**63) for p in problems])
+        return super().fit(problems, keep, threads)
+
+
+def drawn(**options) -> np.ndarray:
+    """First draws of the fits, shape (iterations of both stages, seeds, actions)."""
+    recorder = Recorder()
+    learner = FQI((0, 1), recorder, boost, **options)
+    list(learner.run(stages([Corridor()] * 2, iterations=3), Corridor().states()))
+    return np.array(recorder.draws).reshape(6, 2, 2)
+
+
+def test_every_fit_has_randomness_of_its_own():
+    assert len(np.unique(drawn())) == 6 * 2 * 2
+
+
+def test_the_released_option_fixes_a_seeds_randomness_in_all_its_fits():
+    fixed = drawn(fixed_trees=True)
+    assert [len(np.unique(fixed[:, s])) for s in (0, 1)] == [1, 1]
+    assert len(np.unique(fixed)) == 2
+
+
+def test_the_released_option_shares_one_dataset_a_task():
+    own = FQI((0, 1), Tabular(), warm_start)
+    shared = FQI((0, 1), Tabular(), warm_start, shared_data=True)
+    later = FQI((5,), Tabular(), boost, shared_data=True)
+    (stage,) = stages([Corridor()], iterations=1, new_data=(True,))
+    for learner in (own, shared, later):
+        list(learner.run([stage], Corridor().states()))
+    counts = [learner._datasets for learner in (own, shared, later)]
+    assert not np.array_equal(counts[0][0].multiplicity, counts[0][1].multiplicity)
+    assert counts[1][0] is counts[1][1]
+    assert np.array_equal(counts[1][0].multiplicity, counts[2][0].multiplicity)
 
 
 def test_sums_flatten_and_drop_zeros():

@@ -5,13 +5,18 @@ import hashlib
 import itertools
 import json
 import math
+import signal
+import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bcrl import runner
-from bcrl.errors import BcrlError
+from bcrl.errors import BcrlError, ConfigError
+from bcrl.learners.fqi import FQI
 from bcrl.records import is_complete
 from tests.conftest import plan
 
@@ -112,21 +117,65 @@ def test_a_directory_of_another_config_is_refused_with_the_difference(tmp_path):
         run(tmp_path, "maze", "off", "off", "tag=mine", "algorithm.episodes=6")
 
 
-def test_seeds_share_neither_data_nor_trees(tmp_path):
-    """Also where one of the two is made the same by a released option."""
-    choice = ("car_on_hill", "off", "off", "algorithm.dataset=shared")
-    shared = run(tmp_path, *choice)
-    assert digest(shared, 0) != digest(shared, 1)
+def final_q(p, seed: int) -> np.ndarray:
+    return np.load(p.directory / f"seed_{seed:04d}.npz")["q"]
 
 
-def test_measuring_more_leaves_training_unchanged(tmp_path):
-    few = run(tmp_path, "maze", "on", "on", "env.metrics=[q_error]", "tag=few")
-    all_metrics = run(tmp_path, "maze", "on", "on")
-    for name in ("q", "residuals", "trajectory"):
-        both = [
-            np.load(p.directory / "seed_0000.npz")[name] for p in (few, all_metrics)
-        ]
-        assert np.array_equal(*both)
+def test_seeds_differ_in_data_and_in_trees(tmp_path):
+    """Each alone makes them differ: first the data are shared, then there are no trees."""
+    hill = ("car_on_hill", "off", "off")
+    trees_differ = run(tmp_path, *hill, "algorithm.dataset=shared")
+    assert not np.array_equal(final_q(trees_differ, 0), final_q(trees_differ, 1))
+    data_differ = run(tmp_path, "maze", "off", "off", "algorithm/regressor=tabular")
+    assert not np.array_equal(final_q(data_differ, 0), final_q(data_differ, 1))
+
+
+def test_measuring_leaves_training_unchanged(tmp_path):
+    """A learner that nobody evaluates ends with the same Q, to the bit."""
+    measured = run(tmp_path, "maze", "on", "on")
+    learner = FQI((0, 1), measured.regressor, measured.transfer)
+    *_, last = learner.run(measured.stages, measured.target.states())
+    for seed in (0, 1):
+        assert np.array_equal(last.probed_q[seed], final_q(measured, seed))
+
+
+def test_a_run_killed_at_any_moment_resumes_to_the_same_bytes(tmp_path):
+    whole = run(tmp_path / "whole", "maze", "on", "on", "seeds.lockstep=1")
+    program = "import sys; sys.argv[0] = 'bcrl'; from bcrl.cli import main; main()"
+    choice = ["env=maze", "curriculum=on", "boosting=on", "scale=smoke"]
+    where = [f"runs_dir={tmp_path / 'killed'}", "seeds.lockstep=1"]
+    for line in (3, 12):  # in the first seed, then in the second
+        process = subprocess.Popen(
+            [sys.executable, "-c", program, *choice, *where],
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for _ in range(line):
+            process.stderr.readline()
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process.stderr.close()
+    resumed = run(tmp_path / "killed", "maze", "on", "on", "seeds.lockstep=1")
+    for seed in (0, 1):
+        for suffix in ("csv", "npz"):
+            assert digest(whole, seed, suffix) == digest(resumed, seed, suffix)
+
+
+class Broken:
+    """A regressor that refuses its work, as a full disk might."""
+
+    finite_only = False
+
+    def fit(self, problems, keep, threads):
+        raise ConfigError("key", 1, "must be 2")
+
+
+def test_an_error_in_a_worker_ends_the_run_with_its_message(tmp_path):
+    p = plan("env=maze", "scale=smoke", "progress=none", f"runs_dir={tmp_path}")
+    broken = replace(p, regressor=Broken(), config=p.config | {"workers": 2})
+    with pytest.raises(ConfigError, match="key=1: must be 2"):
+        runner.run(broken)
+    assert not list(p.directory.glob("seed_*"))
 
 
 def test_the_released_maze_and_scikit_learns_forest_run(tmp_path):

@@ -41,7 +41,7 @@ class Env(Protocol):
 
 
 class FiniteEnv(Env, Protocol):
-    """An environment that lists its states, so that its Q is a table, shape (N, A)."""
+    """A deterministic env that lists its states: its Q is a table, shape (N, A)."""
 
     finite: bool  # whether the dynamics stay on the listed states
 
@@ -54,4 +54,4 @@ class FiniteEnv(Env, Protocol):
 
 def is_finite(env: Env) -> bool:
     """Whether `env` is a FiniteEnv whose Q can be tabulated."""
-    return getattr(env, "finite", False)
+    return getattr(env, "finite", False) and env.step_noise == 0

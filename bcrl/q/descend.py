@@ -64,7 +64,7 @@ def walk_down(keys, nodes, values, root, at, who, total):
         left = kept
 
 
-@njit(cache=True, nogil=True)
+@njit
 def predict_forest(nodes, values, first, x):
     """Mean over the trees at `x` (m, d) float32, as float64 (m,)."""
     trees = first.size - 1

@@ -23,8 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bcrl.errors import BcrlError, ConfigError
-from bcrl.q.descend import predict_forest
-from bcrl.q.grow import grow_forest
+from bcrl.q.compiled import grow_forest, predict_forest
 
 #: Stand-ins for what a regression leaves out.
 NO_COUNTS = np.empty(0, np.int64)

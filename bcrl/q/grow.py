@@ -140,7 +140,7 @@ def grown(array, size):
     return larger
 
 
-@njit(cache=True, nogil=True)
+@njit
 def grow_forest(x, y, multiplicity, seeds, queries, settings, keep):
     """Grow one tree per seed and predict at the training and the query rows.
 

@@ -176,6 +176,10 @@ def _assemble(
             short = f"{folder.name}: non-finite {name}, gaps in its mean"
             notes.append(Note(text, env, tag, short, method))
             values[~np.isfinite(values)] = np.nan  # a gap, not a line to infinity
+    sidecars = tuple(
+        read_sidecar(folder / f"seed_{seed:04d}.json", seed) for seed in tables
+    )
+    notes.extend(_mixed_code(folder, env, tag, sidecars))
     return Variant(
         env=env,
         method=method,
@@ -185,10 +189,23 @@ def _assemble(
         stage=reference["stage"].to_numpy()[:rows].astype(np.int64),
         task=reference["task"].to_numpy()[:rows].astype(np.int64),
         metrics=metrics,
-        sidecars=tuple(
-            read_sidecar(folder / f"seed_{seed:04d}.json", seed) for seed in tables
-        ),
+        sidecars=sidecars,
     )
+
+
+def _mixed_code(
+    folder: Path, env: str, tag: str | None, sidecars: tuple[dict[str, Any], ...]
+) -> Iterator[Note]:
+    """A note if a folder's seeds were computed by different code or libraries."""
+    for what, entry, key in (
+        ("git revisions", "git", "revision"),
+        ("versions of numpy", "versions", "numpy"),
+        ("versions of numba", "versions", "numba"),
+    ):
+        found = {str(s.get(entry, {}).get(key))[:10] for s in sidecars}
+        if len(found) > 1:
+            text = f"{folder}: seeds of different {what} ({listed(sorted(found))})"
+            yield Note(text, env, tag)
 
 
 def _bad(row: NDArray[np.float64]) -> bool:
