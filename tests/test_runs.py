@@ -122,7 +122,7 @@ def final_q(p, seed: int) -> np.ndarray:
 
 
 def test_seeds_differ_in_data_and_in_trees(tmp_path):
-    """Each alone makes them differ: first the data are shared, then there are no trees."""
+    """Each alone suffices: first the data are shared, then there are no trees."""
     hill = ("car_on_hill", "off", "off")
     trees_differ = run(tmp_path, *hill, "algorithm.dataset=shared")
     assert not np.array_equal(final_q(trees_differ, 0), final_q(trees_differ, 1))
