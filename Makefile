@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 
 .DEFAULT_GOAL := help
 .PHONY: help setup figures paper smoke test lint bench clean
@@ -25,8 +26,8 @@ figures: $(READY) ## Figures 1, 2, 3 and 5 from runs of your own: 3 seeds a vari
 	$(BIN)/bcrl-report --scale quick
 
 paper: $(READY) ## the same at the paper's number of seeds
-	$(BIN)/bcrl experiment=fig1 scale=paper workers=2
-	$(BIN)/bcrl experiment=fig2 scale=paper workers=2
+	$(BIN)/bcrl experiment=fig1 scale=paper workers=$(WORKERS)
+	$(BIN)/bcrl experiment=fig2 scale=paper workers=$(WORKERS)
 	$(BIN)/bcrl-report --scale paper
 
 smoke: $(READY) ## every variant in seconds, then the report

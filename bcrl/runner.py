@@ -88,10 +88,11 @@ def _leave_interrupts() -> None:
 
 
 def _drain(ticks: queue.Queue, tick: Callable[[Tick], None]) -> None:
-    """Hand on the workers' ticks until none has come for a moment."""
+    """Hand on the workers' ticks, waiting for a moment if there is none."""
     try:
-        while True:
-            tick(ticks.get(timeout=0.2))
+        tick(ticks.get(timeout=0.2))
+        for _ in range(ticks.qsize()):
+            tick(ticks.get_nowait())
     except queue.Empty:
         return
 

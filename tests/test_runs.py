@@ -5,6 +5,7 @@ import hashlib
 import itertools
 import json
 import math
+import os
 import signal
 import subprocess
 import sys
@@ -159,6 +160,23 @@ def test_a_run_killed_at_any_moment_resumes_to_the_same_bytes(tmp_path):
     for seed in (0, 1):
         for suffix in ("csv", "npz"):
             assert digest(whole, seed, suffix) == digest(resumed, seed, suffix)
+
+
+def test_ctrl_c_ends_all_workers_and_keeps_what_is_complete(tmp_path):
+    program = "import sys; sys.argv[0] = 'bcrl'; from bcrl.cli import main; main()"
+    choice = ["env=maze", "workers=2", "seeds.count=2", f"runs_dir={tmp_path}"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, *choice],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    process.stderr.readline()
+    os.killpg(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "interrupted" in said and "Traceback" not in said
+    assert [p.name for p in tmp_path.glob("quick/maze/FQI/*")] == ["config.yaml"]
 
 
 class Broken:
