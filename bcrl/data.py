@@ -1,4 +1,4 @@
-"""Datasets of transitions, stored as distinct points and distinct rows with counts."""
+"""Datasets of transitions over distinct points; a finite env's rows have counts."""
 
 from __future__ import annotations
 
@@ -62,16 +62,9 @@ def build(env: Env, episodes: Episodes, seed: int, probe: NDArray) -> Dataset:
         first, label = _distinct(every.T)
         points = every[first]
         state, next_state, probed = np.split(label, [len(before), 2 * len(before)])
-        columns = (
-            state,
-            action,
-            episodes.reward[seed][seen],
-            next_state,
-            episodes.absorbing[seed][seen],
-        )
-        first, label = _distinct(columns)
-        state, action, reward, next_state, absorbing = (c[first] for c in columns)
-        multiplicity = np.bincount(label, minlength=len(first))
+        reward = episodes.reward[seed][seen]
+        absorbing = episodes.absorbing[seed][seen]
+        multiplicity = np.ones(len(state), np.int64)  # a continuum seldom repeats
     by_action = tuple(
         _action_rows(points, state, np.flatnonzero(action == a), multiplicity)
         for a in range(env.n_actions)

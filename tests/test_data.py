@@ -40,7 +40,8 @@ def test_the_dataset_is_the_episodes_with_repetitions_counted(env):
         d.absorbing[again],
     )
     assert found == expected
-    assert len(d.state) < len(expected)  # the corridor repeats itself
+    if env.finite:
+        assert len(d.state) <= 10 < len(expected)  # the corridor repeats itself
     assert np.array_equal(d.points[d.probe], probe)
     for a, part in enumerate(d.by_action):
         assert (d.action[part.rows] == a).all()

@@ -19,6 +19,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -150,8 +151,13 @@ def _spread(function: Callable, items: Sequence, threads: int) -> list:
     threads = min(threads, len(items), 4 * (os.cpu_count() or 1))
     if threads <= 1:
         return [function(item) for item in items]
-    with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(function, items))
+    return list(_pool(threads).map(function, items))
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """One pool for all calls: small predictions would cost less than its threads."""
+    return ThreadPoolExecutor(threads)
 
 
 def _limits(settings: TreeSettings) -> tuple[int, int]:

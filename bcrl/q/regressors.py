@@ -77,7 +77,7 @@ class ForestRegressor:
                 p.x,
                 p.y,
                 p.rng.integers(2**64, size=self.trees, dtype=np.uint64),
-                p.multiplicity,
+                None if (p.multiplicity == 1).all() else p.multiplicity,
                 p.queries,
             )
             for p in problems
