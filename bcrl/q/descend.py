@@ -13,7 +13,7 @@ TOGETHER = 1000
 
 
 @bare
-def send_down(keys, row, d, nodes, values, root, stack, total):
+def send_down(keys, words, row, d, nodes, values, root, stack, total):
     """Add one tree's predictions to `total`, moving all rows down together."""
     node, depth, top = root, 0, 0
     size = U(total.size)
@@ -25,7 +25,9 @@ def send_down(keys, row, d, nodes, values, root, stack, total):
             add_value(row, here + start, here + stop, values[child], total)
         else:
             cut, feature = nodes[node].cut, nodes[node].feature
-            middle = move_queries(keys, row, size, d, depth, start, stop, feature, cut)
+            middle = move_queries(
+                keys, words, row, size, d, depth, start, stop, feature, cut
+            )
             depth += 1
             if middle < stop:
                 stack[top, 0], stack[top, 1] = child + 1, depth
@@ -68,12 +70,13 @@ def walk_down(keys, nodes, values, root, at, who, total):
 def predict_forest(nodes, values, first, x):
     """Mean over the trees at `x` (m, d) float32, as float64 (m,)."""
     trees = first.size - 1
-    total = np.zeros(x.shape[0])
+    total, d = np.zeros(x.shape[0]), U(x.shape[1])
     if x.shape[0] >= TOGETHER:
-        keys, row, _, _ = new_rows(x, False, False)
+        keys, words, row, _, _ = new_rows(x, False, False)
         stack = np.empty((x.shape[0] + 1, 4), np.int64)
         for t in range(trees):
-            send_down(keys, row, U(x.shape[1]), nodes, values, first[t], stack, total)
+            root = first[t]
+            send_down(keys, words, row, d, nodes, values, root, stack, total)
     else:
         walking = np.empty(x.shape, np.int32)
         at, who = np.empty((2, x.shape[0]), np.int64)

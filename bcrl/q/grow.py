@@ -12,10 +12,12 @@ from bcrl.q.rows import add_value, move_queries, move_rows, new_rows, plane
 @bare
 def grow_tree(
     keys,
+    words,
     row,
     target,
     weight,
     q_keys,
+    q_words,
     q_row,
     d,
     w_node,
@@ -35,7 +37,7 @@ def grow_tree(
 ):
     """Grow one tree depth first and add its predictions to `fitted` and `queried`.
 
-    keys … weight, q_keys, q_row: buffers of `new_rows`; w_node, s_node: weight and sum
+    keys … weight, q_keys … q_row: buffers of `new_rows`; w_node, s_node: weight and sum
     of targets of all rows; unit: target of fixed-point 1; settings: as in
     `grow_forest`; nodes, values: where to put the tree if `keep`, from `n_nodes` and
     `n_values` on. Returns the new `n_nodes`, `n_values`, and the tree's depth.
@@ -60,7 +62,6 @@ def grow_tree(
                     keys,
                     target,
                     weight,
-                    size,
                     base,
                     here,
                     start,
@@ -75,7 +76,6 @@ def grow_tree(
                     keys,
                     target,
                     weight,
-                    size,
                     base,
                     here,
                     start,
@@ -109,12 +109,12 @@ def grow_tree(
             w_node, s_node = stack[top, 6], stack[top, 7]
             continue
         middle = move_rows(
-            keys, row, target, weight, size, d, depth, start, stop, feature, cut
+            keys, words, row, target, weight, size, d, depth, start, stop, feature, cut
         )
         q_middle = q_start
         if q_start < q_stop:
             q_middle = move_queries(
-                q_keys, q_row, q_size, d, depth, q_start, q_stop, feature, cut
+                q_keys, q_words, q_row, q_size, d, depth, q_start, q_stop, feature, cut
             )
         if keep:
             nodes[node].cut = cut
@@ -151,8 +151,8 @@ def grow_forest(x, y, multiplicity, seeds, queries, settings, keep):
     (n,), queried (m,); nodes and values are empty unless `keep`.
     """
     weighted = multiplicity.size > 0
-    keys, row, target, weight = new_rows(x, True, weighted)
-    q_keys, q_row, _, _ = new_rows(queries, False, False)
+    keys, words, row, target, weight = new_rows(x, True, weighted)
+    q_keys, q_words, q_row, _, _ = new_rows(queries, False, False)
     w_all, largest = np.int64(0), 0.0
     for i in range(y.size):
         w_all += multiplicity[i] if weighted else 1
@@ -181,10 +181,12 @@ def grow_forest(x, y, multiplicity, seeds, queries, settings, keep):
             nodes, values = grown(nodes, 2 * room), grown(values, room)
         first[t + 1], leaves, depths[t] = grow_tree(
             keys,
+            words,
             row,
             target,
             weight,
             q_keys,
+            q_words,
             q_row,
             U(x.shape[1]),
             w_all,

@@ -6,7 +6,7 @@ Three representations make the loops fast and the results exact:
   that comparisons and minima are integer operations, which vectorise;
 * targets are **fixed-point** int64, so that sums are exact and independent of the order
   of rows, of the vector width and of the machine (sums of floats are none of these);
-* the rows of a node lie side by side (`bcrl.q.rows`).
+* the rows of a node lie side by side, a row's keys next to each other (`bcrl.q.rows`).
 
 Because sums are exact, a row of multiplicity 3 and three equal rows give the same tree
 bit for bit, and so does any order of the rows.
@@ -128,14 +128,13 @@ def gain(low, high, weight, total, node_weight, node_total, min_leaf):
 
 @woven
 def choose_two(
-    keys, target, weight, size, base, here, start, stop, w_node, s_node, min_leaf, state
+    keys, target, weight, base, here, start, stop, w_node, s_node, min_leaf, state
 ):
     """`choose` for two features, both tried: both in one pass over the rows."""
-    one = base + size
-    low0 = high0 = keys[base + start]
-    low1 = high1 = keys[one + start]
+    low0 = high0 = keys[base + TWO * start]
+    low1 = high1 = keys[base + TWO * start + ONE]
     for i in range(start + ONE, stop):
-        key0, key1 = keys[base + i], keys[one + i]
+        key0, key1 = keys[base + TWO * i], keys[base + TWO * i + ONE]
         low0, high0 = min(low0, key0), max(high0, key0)
         low1, high1 = min(low1, key1), max(high1, key1)
     state += GOLDEN
@@ -147,8 +146,8 @@ def choose_two(
         for i in range(start, stop):
             w = weight[here + i]
             wy = w * target[here + i]
-            goes0 = -np.int64(keys[base + i] <= cut0)  # all bits set, or none
-            goes1 = -np.int64(keys[one + i] <= cut1)
+            goes0 = -np.int64(keys[base + TWO * i] <= cut0)  # all bits set, or none
+            goes1 = -np.int64(keys[base + TWO * i + ONE] <= cut1)
             w0 += w & goes0
             s0 += wy & goes0
             w1 += w & goes1
@@ -156,8 +155,8 @@ def choose_two(
     else:
         for i in range(start, stop):
             y = target[here + i]
-            goes0 = -np.int64(keys[base + i] <= cut0)
-            goes1 = -np.int64(keys[one + i] <= cut1)
+            goes0 = -np.int64(keys[base + TWO * i] <= cut0)
+            goes1 = -np.int64(keys[base + TWO * i + ONE] <= cut1)
             w0 -= goes0
             s0 += y & goes0
             w1 -= goes1
@@ -180,7 +179,6 @@ def choose(
     keys,
     target,
     weight,
-    size,
     base,
     here,
     start,
@@ -212,17 +210,18 @@ def choose(
         feature = order[pick]
         order[pick] = order[left]
         order[left] = feature
-        column = base + U(feature) * size
-        low = high = keys[column + start]
-        for i in range(column + start + ONE, column + stop):
-            low, high = min(low, keys[i]), max(high, keys[i])
+        column, d = base + U(feature), U(order.size)
+        low = high = keys[column + start * d]
+        for i in range(start + ONE, stop):
+            key = keys[column + i * d]
+            low, high = min(low, key), max(high, key)
         if value_of(high) <= np.float32(value_of(low) + CONSTANT):
             constants += 1
             continue
         cut = draw_cut(low, high, bits >> U(32))
         w = s = np.int64(0)
         for i in range(start, stop):
-            goes = -np.int64(keys[column + i] <= cut)
+            goes = -np.int64(keys[column + i * d] <= cut)
             if weight.size > 0:
                 w += weight[here + i] & goes
                 s += (weight[here + i] * target[here + i]) & goes

@@ -17,20 +17,22 @@ from bcrl.q.kernel import ONE, TWO, ZERO, U, key_of, woven
 def new_rows(x, carries, weighted):
     """Buffers whose first plane holds `x` (size, d); targets and weights to be filled.
 
-    keys: (3·d·size,) int32, within a plane feature by feature; row: (3·size,) uint32,
-    the index the row was given under; target: (3·size,) int64, or empty for query rows;
-    weight: (3·size,) int64 multiplicities, or empty if all are 1.
+    keys: (3·d·size,) int32, row by row; words: the same memory as int64, so that the
+    two keys of a row move as one; row: (3·size,) uint32, the index the row was given
+    under; target: (3·size,) int64, or empty for query rows; weight: (3·size,) int64
+    multiplicities, or empty if all are 1.
     """
     size, d = U(x.shape[0]), U(x.shape[1])
-    keys = np.empty(U(3) * d * size, np.int32)
+    room = U(3) * d * size
+    keys = np.empty(room + (room & ONE), np.int32)
     row = np.empty(U(3) * size, np.uint32)
     for i in range(size):
         row[i] = i
         for f in range(d):
-            keys[f * size + i] = key_of(x[i, f])
+            keys[i * d + f] = key_of(x[i, f])
     target = np.empty(U(3) * size if carries else ZERO, np.int64)
     weight = np.empty(U(3) * size if weighted else ZERO, np.int64)
-    return keys, row, target, weight
+    return keys, keys.view(np.int64), row, target, weight
 
 
 @woven
@@ -40,18 +42,19 @@ def plane(depth):
 
 
 @woven
-def move_rows(keys, row, target, weight, size, d, depth, start, stop, feature, cut):
+def move_rows(
+    keys, words, row, target, weight, size, d, depth, start, stop, feature, cut
+):
     """Move a node's rows to its children's plane, left ones first; where these end."""
     a, b = plane(depth) * size, plane(depth + 1) * size
-    base, out = a * d, b * d
-    by = base + U(feature) * size
     left, right = start, stop - ONE
     if d == TWO:
+        shift = np.int64(32) * feature
         for i in range(start, stop):
-            goes = U(keys[by + i] <= cut)
+            word = words[a + i]
+            goes = U(np.int32(word >> shift) <= cut)
             p = left if goes else right
-            keys[out + p] = keys[base + i]
-            keys[out + size + p] = keys[base + size + i]
+            words[b + p] = word
             row[b + p] = row[a + i]
             target[b + p] = target[a + i]
             if weight.size > 0:
@@ -60,10 +63,10 @@ def move_rows(keys, row, target, weight, size, d, depth, start, stop, feature, c
             right -= ONE - goes
     else:
         for i in range(start, stop):
-            goes = U(keys[by + i] <= cut)
+            goes = U(keys[(a + i) * d + U(feature)] <= cut)
             p = left if goes else right
             for f in range(d):
-                keys[out + f * size + p] = keys[base + f * size + i]
+                keys[(b + p) * d + f] = keys[(a + i) * d + f]
             row[b + p] = row[a + i]
             target[b + p] = target[a + i]
             if weight.size > 0:
@@ -74,27 +77,26 @@ def move_rows(keys, row, target, weight, size, d, depth, start, stop, feature, c
 
 
 @woven
-def move_queries(keys, row, size, d, depth, start, stop, feature, cut):
+def move_queries(keys, words, row, size, d, depth, start, stop, feature, cut):
     """`move_rows` for query rows, which have neither target nor weight."""
     a, b = plane(depth) * size, plane(depth + 1) * size
-    base, out = a * d, b * d
-    by = base + U(feature) * size
     left, right = start, stop - ONE
     if d == TWO:
+        shift = np.int64(32) * feature
         for i in range(start, stop):
-            goes = U(keys[by + i] <= cut)
+            word = words[a + i]
+            goes = U(np.int32(word >> shift) <= cut)
             p = left if goes else right
-            keys[out + p] = keys[base + i]
-            keys[out + size + p] = keys[base + size + i]
+            words[b + p] = word
             row[b + p] = row[a + i]
             left += goes
             right -= ONE - goes
     else:
         for i in range(start, stop):
-            goes = U(keys[by + i] <= cut)
+            goes = U(keys[(a + i) * d + U(feature)] <= cut)
             p = left if goes else right
             for f in range(d):
-                keys[out + f * size + p] = keys[base + f * size + i]
+                keys[(b + p) * d + f] = keys[(a + i) * d + f]
             row[b + p] = row[a + i]
             left += goes
             right -= ONE - goes
