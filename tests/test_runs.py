@@ -163,7 +163,11 @@ def test_a_run_killed_at_any_moment_resumes_to_the_same_bytes(tmp_path):
 
 
 def test_ctrl_c_ends_all_workers_and_keeps_what_is_complete(tmp_path):
-    program = "import sys; sys.argv[0] = 'bcrl'; from bcrl.cli import main; main()"
+    program = (
+        "import signal, sys; from bcrl.cli import main; sys.argv[0] = 'bcrl';"
+        # A shell's background jobs, and so perhaps this test, ignore it from the start.
+        "signal.signal(signal.SIGINT, signal.default_int_handler); main()"
+    )
     choice = ["env=maze", "workers=2", "seeds.count=2", f"runs_dir={tmp_path}"]
     process = subprocess.Popen(
         [sys.executable, "-c", program, *choice],
