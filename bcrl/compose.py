@@ -17,14 +17,13 @@ from bcrl.config import (
     Choice,
     Config,
     FQISettings,
-    at_least,
     construct,
     one_of,
     per_task,
 )
 from bcrl.curriculum import CURRICULA
 from bcrl.envs import Env, env_class, is_finite
-from bcrl.errors import ConfigError, did_you_mean
+from bcrl.errors import ConfigError, at_least, did_you_mean
 from bcrl.learners.fqi import Stage
 from bcrl.q.regressors import Regressor, regressor_class
 from bcrl.transfer import Transfer, boost, warm_start

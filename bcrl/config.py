@@ -80,12 +80,6 @@ def one_of(key: str, value: object, allowed: Sequence[str]) -> None:
         raise ConfigError(key, value, did_you_mean(str(value), allowed))
 
 
-def at_least(key: str, value: int | None, least: int) -> None:
-    """Raise ConfigError if `value` is below `least`; None passes."""
-    if value is not None and value < least:
-        raise ConfigError(key, value, f"must be at least {least}")
-
-
 def construct(section: str, cls: type, values: Mapping[str, Any]) -> Any:
     """`cls(**values)` with every key known and every value of its annotated type.
 

@@ -21,6 +21,12 @@ class ConfigError(BcrlError):
         return type(self), self._arguments  # so that it can leave a worker process
 
 
+def at_least(key: str, value: int | None, least: int) -> None:
+    """Raise ConfigError if `value` is below `least`; None passes."""
+    if value is not None and value < least:
+        raise ConfigError(key, value, f"must be at least {least}")
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """`did you mean maze?`, with the known words listed as long as they are few."""
     known = sorted(known)

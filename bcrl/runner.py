@@ -33,7 +33,7 @@ def run(plan: Plan) -> None:
     if not pending:
         return
     if any(metric.startswith("q_error") for metric in plan.metrics):
-        for task in dict.fromkeys((*plan.tasks[-1:], *(s.env for s in plan.stages))):
+        for task in dict.fromkeys((plan.target, *(s.env for s in plan.stages))):
             oracle.reference(task)  # searched for once, here, and kept on disk
     progress = Progress(name, pending, plan.iterations, plan.config["progress"])
     try:

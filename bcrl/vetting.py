@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from argparse import Namespace
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -75,12 +75,22 @@ def _refuse_nonsense(
             isinstance(value, list) or override.is_sweep_override()
         ):
             raise BcrlError("experiment: one at a time, each is a sweep of its own")
-        places = [Path(folder, "budget") for folder in (CONF, *folders)]
-        known = {path.stem for place in places for path in place.glob("*.yaml")}
-        if key == "budget" and value not in known:
-            raise BcrlError(f"budget={value}: {did_you_mean(str(value), known)}")
+        if key == "budget":
+            swept = override.is_sweep_override()
+            _check_budgets(
+                override.sweep_string_iterator() if swept else [value], folders
+            )
     if arguments.multirun and getattr(arguments, "cfg", None):
         raise BcrlError("--cfg shows one composition; drop -m and the sweep")
+
+
+def _check_budgets(names: Iterable[object], folders: Folders) -> None:
+    """Raise BcrlError for a budget that no folder has: the group itself is optional."""
+    places = [Path(folder, "budget") for folder in (CONF, *folders)]
+    known = {path.stem for place in places for path in place.glob("*.yaml")}
+    for name in map(str, names):
+        if name not in known:
+            raise BcrlError(f"budget={name}: {did_you_mean(name, known)}")
 
 
 def plan(

@@ -65,6 +65,7 @@ BAD = {
     "two experiments": (["experiment=[fig1,fig2]"], ["experiment", "one at a time"]),
     "swept experiments": (["experiment=fig1,fig2"], ["experiment", "one at a time"]),
     "unknown budget": ([MAZE, "budget=maze_fqy"], ["budget=maze_fqy", "maze_fqi"]),
+    "swept budgets": ([MAZE, "budget=maze_fqi,nope"], ["budget=nope"]),
     "added key on top": ([MAZE, "+iterations=3"], ["iterations=3", "unknown key"]),
     "a task's key twice": ([MAZE, "+env.height=0.3"], ["env.height=0.3", "env.tasks"]),
     "added to a choice": (

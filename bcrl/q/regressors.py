@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.errors import ConfigError, did_you_mean
+from bcrl.errors import ConfigError, at_least, did_you_mean
 from bcrl.q import forest
 
 
@@ -51,11 +51,6 @@ class Regressor(Protocol):
         """Each model's predictions (n,) at its own points (n, d)."""
 
 
-def _at_least(key: str, value: int, least: int) -> None:
-    if value < least:
-        raise ConfigError(f"algorithm.regressor.{key}", value, f"at least {least}")
-
-
 @dataclass(frozen=True)
 class ForestRegressor:
     """Extremely randomised trees, compiled (Geurts et al. 2006; Ernst et al. 2005)."""
@@ -66,9 +61,9 @@ class ForestRegressor:
     finite_only = False
 
     def __post_init__(self) -> None:
-        _at_least("trees", self.trees, 1)
-        _at_least("min_samples_split", self.min_samples_split, 2)
-        _at_least("min_samples_leaf", self.min_samples_leaf, 1)
+        at_least("algorithm.regressor.trees", self.trees, 1)
+        at_least("algorithm.regressor.min_samples_split", self.min_samples_split, 2)
+        at_least("algorithm.regressor.min_samples_leaf", self.min_samples_leaf, 1)
 
     def fit(self, problems: Sequence[Problem], keep: bool, threads: int) -> list[Fit]:
         settings = forest.TreeSettings(self.min_samples_split, self.min_samples_leaf)
