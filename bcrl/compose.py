@@ -1,4 +1,4 @@
-"""From a composed configuration to a plan: stages, transfer, variant and directory."""
+"""From a composed configuration to a plan: stages, transfers, variant, directory."""
 
 from __future__ import annotations
 
@@ -6,29 +6,24 @@ import dataclasses
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from bcrl import probes
-from bcrl.config import (
-    OUTPUT_KEYS,
-    Choice,
-    Config,
-    FQISettings,
-    construct,
-    one_of,
-    per_task,
-)
+from bcrl.algorithms import Composition, Plain, algorithm
+from bcrl.config import OUTPUT_KEYS, Choice, Config, construct, one_of
 from bcrl.curriculum import CURRICULA
-from bcrl.envs import Env, env_class, is_finite
+from bcrl.envs import Env, env_class
 from bcrl.errors import ConfigError, at_least, did_you_mean
-from bcrl.learners.fqi import Stage
-from bcrl.q.regressors import Regressor, regressor_class
-from bcrl.transfer import Transfer, boost, warm_start
-
-Plain = dict[str, Any]  # a resolved config: dicts, lists and scalars
+from bcrl.stage import Stage
+from bcrl.transfer import (
+    TRANSFERS,
+    Boost,
+    PolicyReuse,
+    ResidualPolicy,
+    Shape,
+)
 
 
 @dataclass(frozen=True)
@@ -38,14 +33,13 @@ class Plan:
     env: str  # the choice's name, "maze"; several may use one environment
     variant: str  # "BC-FQI"
     tag: str | None
+    family: str  # how it is measured: "FQI" by iterations, "DQN" by steps
     stages: tuple[Stage, ...]
     tasks: tuple[Env, ...]  # easiest first, the target last
     metrics: tuple[str, ...]
-    regressor: Regressor
-    transfer: Transfer
-    shared_data: bool
-    fixed_trees: bool
     seeds: tuple[int, ...]
+    lockstep: int
+    device: str
     config: Plain  # resolved, whole
 
     @property
@@ -69,9 +63,9 @@ class Plan:
         return self.root / self.config["scale"]["name"] / self.env / self.name
 
     @property
-    def iterations(self) -> int:
-        """Rows of a seed's CSV."""
-        return sum(stage.iterations for stage in self.stages)
+    def length(self) -> int:
+        """Iterations or environment steps of all stages."""
+        return sum(stage.learner.length for stage in self.stages)
 
 
 def identity(config: Plain) -> Plain:
@@ -100,51 +94,124 @@ def flat(config: Plain, prefix: str = "") -> Plain:
     return out
 
 
-def plan(config: Plain, variant_defaults: Plain, env: str) -> Plan:
+def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
     """The checked plan of a resolved config; ConfigError says what can't be.
 
-    `variant_defaults` is the same choice of groups without any value overridden: where
-    the config departs from it, the results get a directory of their own, below the
-    name of the `env` choice.
+    `known` maps a tag to the config of the same choice of groups without any value
+    overridden: None to the paper's reading, "released" to the authors' code's. Where
+    the config departs from all of them, its results get a directory of their own, below
+    the name of the `env` choice.
     """
     _check_outputs(config)
     tasks, metrics = _tasks(config["env"])
-    settings: FQISettings = construct("algorithm", FQISettings, config["algorithm"])
-    one_of("algorithm.name", settings.name, ["fqi"])
-    one_of("curriculum.name", config["curriculum"]["name"], list(CURRICULA))
-    one_of("boosting.name", config["boosting"]["name"], ["on", "off"])
-    one_of("transfer.name", config["transfer"]["name"], ["none"])
-    curriculum = config["curriculum"]["name"] != "off"
-    boosting = config["boosting"]["name"] == "on"
-    if len(tasks) == 1 and (curriculum or boosting):
-        key = "curriculum" if curriculum else "boosting"
-        why = f"{config['env']['name']} has one task, so there is no stage to hand over"
-        raise ConfigError(key, "on", f"{why}; env.tasks needs at least two values")
-    regressor = _regressor(settings, tasks[-1])
-    stages = _stages(config, settings, tasks)
-    if settings.dataset == "shared" and any(s.epsilon < 1 for s in stages):
-        why = "seeds can share data only if all are random: algorithm.epsilon must be 1"
-        raise ConfigError("algorithm.dataset", "shared", why)
-    prefix = "B" * boosting + "C" * curriculum
-    changed = differences(config, variant_defaults)
+    section = config["algorithm"]
+    if not isinstance(section, dict):
+        raise ConfigError("algorithm", section, "must be a section with a name")
+    name = section.get("name")
+    chosen_algorithm = algorithm(name)
+    chosen = _composition(config, tasks)
+    stages = chosen_algorithm.stages(section, chosen)
+    differing = {tag: differences(config, other) for tag, other in known.items()}
+    same = [tag for tag, changed in differing.items() if not changed]
+    tag = same[0] if same else _short_hash(differing[None])
+    lockstep = config["seeds"]["lockstep"]
     return Plan(
         env=env,
-        variant=f"{prefix}-{settings.name.upper()}"
-        if prefix
-        else settings.name.upper(),
-        tag=config["tag"] or (_short_hash(changed) if changed else None),
+        variant=_variant(name, chosen),
+        tag=config["tag"] or tag,
+        family=chosen_algorithm.FAMILY,
         stages=stages,
         tasks=tuple(tasks),
         metrics=metrics,
-        regressor=regressor,
-        transfer=boost if boosting else warm_start,
-        shared_data=settings.dataset == "shared",
-        fixed_trees=settings.fit_randomness == "fixed",
         seeds=tuple(
             config["seeds"]["first"] + i for i in range(config["seeds"]["count"])
         ),
+        lockstep=lockstep or chosen_algorithm.LOCKSTEP,
+        device=_device(config["device"], chosen_algorithm.FAMILY),
         config=config,
     )
+
+
+def _composition(config: Plain, tasks: list[Env]) -> Composition:
+    """The groups' choices, as far as they make sense together."""
+    one_of("curriculum.name", config["curriculum"]["name"], list(CURRICULA))
+    curriculum = config["curriculum"]["name"] != "off"
+    boost, transfer = _boost(config["boosting"]), _transfer(config["transfer"])
+    if len(tasks) == 1 and (curriculum or boost or transfer):
+        key = "curriculum" if curriculum else "boosting" if boost else "transfer"
+        why = f"{config['env']['name']} has one task, so there is no stage to hand over"
+        raise ConfigError(
+            key,
+            config[key]["name"],
+            f"{why}; env.tasks needs at least two values",
+        )
+    if isinstance(transfer, (PolicyReuse, ResidualPolicy)) and not curriculum:
+        why = "needs an earlier task whose policy helps: curriculum=on"
+        raise ConfigError("transfer", config["transfer"]["name"], why)
+    if isinstance(transfer, ResidualPolicy) and boost:
+        why = (
+            "its Q is about its own actions, not the executed ones that a base is "
+            "about: boosting=off"
+        )
+        raise ConfigError("transfer", "residual_policy", why)
+    order = CURRICULA[config["curriculum"]["name"]](len(tasks))
+    return Composition(tuple(tasks), tuple(order), boost, transfer, config["scale"])
+
+
+def _boost(section: Plain) -> Boost | None:
+    values = _named("boosting", section, ["on", "off"])
+    if section["name"] == "off":
+        construct("boosting", Choice, section)
+        return None
+    boost = construct("boosting", Boost, values)
+    one_of("boosting.greedy_on", boost.greedy_on, ["sum", "residual"])
+    one_of("boosting.maxima", boost.maxima, ["one", "two"])
+    return boost
+
+
+def _transfer(section: Plain) -> Shape | PolicyReuse | ResidualPolicy | None:
+    values = _named("transfer", section, ["none", *TRANSFERS])
+    if section["name"] == "none":
+        construct("transfer", Choice, section)
+        return None
+    transfer = construct("transfer", TRANSFERS[section["name"]], values)
+    if isinstance(transfer, Shape):
+        one_of("transfer.next_state", transfer.next_state, ["stored", "before_reset"])
+    return transfer
+
+
+def _named(group: str, section: object, names: list[str]) -> Plain:
+    """A section's values besides its name, which must be one of `names`."""
+    if not isinstance(section, dict):
+        raise ConfigError(group, section, "must be a section with a name")
+    one_of(f"{group}.name", section.get("name"), names)
+    return {key: value for key, value in section.items() if key != "name"}
+
+
+def _variant(algorithm_name: str, chosen: Composition) -> str:
+    """`SBC-DQN` and the like; policy reuse and residual policy by their own names."""
+    prefix = "S" * isinstance(chosen.transfer, Shape)
+    prefix += "B" * (chosen.boost is not None) + "C" * (not chosen.target_only)
+    name = algorithm_name.upper()
+    whole = f"{prefix}-{name}" if prefix else name
+    if isinstance(chosen.transfer, ResidualPolicy):
+        return "RPL"
+    if isinstance(chosen.transfer, PolicyReuse):
+        return f"PPR-{whole}" if chosen.boost else "PPR"
+    return whole
+
+
+def _device(wanted: str, family: str) -> str:
+    """`cpu` or `cuda`; ConfigError if there is no such device."""
+    one_of("device", wanted, ["cpu", "cuda", "auto"])
+    if family != "DQN" or wanted == "cpu":
+        return "cpu"  # forests grow on the CPU
+    import torch
+
+    there = torch.cuda.is_available()
+    if wanted == "cuda" and not there:
+        raise ConfigError("device", "cuda", "torch finds no CUDA device; device=cpu")
+    return "cuda" if there else "cpu"
 
 
 def _short_hash(changed: Mapping[str, tuple[Any, Any]]) -> str:
@@ -159,8 +226,7 @@ def _check_outputs(config: Plain) -> None:
     for key, value in config.items():
         if key not in known:
             raise ConfigError(key, value, f"unknown key; {did_you_mean(key, known)}")
-    for group in ("curriculum", "boosting", "transfer"):
-        construct(group, Choice, config[group])
+    construct("curriculum", Choice, config["curriculum"])
     at_least("seeds.first", seeds["first"], 0)
     at_least("seeds.count", seeds["count"], 1)
     at_least("seeds.lockstep", seeds["lockstep"], 1)
@@ -168,6 +234,7 @@ def _check_outputs(config: Plain) -> None:
     at_least("threads", config["threads"], 1)
     at_least("scale.max_iterations", scale["max_iterations"], 1)
     at_least("scale.max_episodes", scale["max_episodes"], 1)
+    at_least("scale.max_steps", scale["max_steps"], 1)
     one_of("progress", config["progress"], ["auto", "bar", "lines", "none"])
     for key, value in (("tag", config["tag"]), ("scale.name", scale["name"])):
         if value is not None and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", value):
@@ -206,50 +273,3 @@ def _tasks(section: Plain) -> tuple[list[Env], tuple[str, ...]]:
         raise ConfigError("env.metrics", metrics, "must be a list of metric names")
     probes.check(metrics, tasks[-1])
     return tasks, tuple(metrics)
-
-
-def _regressor(settings: FQISettings, target: Env) -> Regressor:
-    values = dict(settings.regressor)
-    cls = regressor_class(str(values.pop("name", None)))
-    regressor = construct("algorithm.regressor", cls, values)
-    if regressor.finite_only and not is_finite(target):
-        why = f"needs finitely many states, which {target.name} has not"
-        raise ConfigError("algorithm.regressor", settings.regressor["name"], why)
-    return regressor
-
-
-def _stages(
-    config: Plain, settings: FQISettings, tasks: Sequence[Env]
-) -> tuple[Stage, ...]:
-    """One stage a task slot, with the scale's caps on its budget."""
-    n = len(tasks)
-    one_of("algorithm.new_data", settings.new_data, ["stage", "task"])
-    one_of("algorithm.dataset", settings.dataset, ["own", "shared"])
-    one_of("algorithm.fit_randomness", settings.fit_randomness, ["fresh", "fixed"])
-    iterations = per_task("algorithm.iterations", settings.iterations, n, int, 1)
-    episodes = per_task("algorithm.episodes", settings.episodes, n, int, 1)
-    epsilon = per_task("algorithm.epsilon", settings.epsilon, n, float, 0, 1)
-    order = CURRICULA[config["curriculum"]["name"]](n)
-    cap = config["scale"]
-    stages = []
-    for slot, task in enumerate(order):
-        again = slot > 0 and order[slot - 1] == task and settings.new_data == "task"
-        if again and (epsilon[slot], episodes[slot]) != (epsilon[0], episodes[0]):
-            why = "the task's data are kept, so epsilon and episodes must stay the same"
-            raise ConfigError("algorithm.new_data", "task", why)
-        stages.append(
-            Stage(
-                number=slot + 1,
-                task=task + 1,
-                env=tasks[task],
-                iterations=_capped(iterations[slot], cap["max_iterations"]),
-                episodes=_capped(episodes[slot], cap["max_episodes"]),
-                epsilon=epsilon[slot],
-                new_data=not again,
-            )
-        )
-    return tuple(stages)
-
-
-def _capped(value: int, cap: int | None) -> int:
-    return value if cap is None else min(value, cap)

@@ -18,7 +18,7 @@ from bcrl.errors import ConfigError, did_you_mean
 class Seeds:
     first: int = 0
     count: int = 3
-    lockstep: int = 4  # seeds that train together in one process
+    lockstep: int | None = None  # seeds that train together; null: the algorithm's
 
 
 @dataclass
@@ -26,6 +26,7 @@ class Scale:
     name: str = MISSING
     max_iterations: int | None = None  # caps a slot's budget
     max_episodes: int | None = None
+    max_steps: int | None = None
 
 
 @dataclass
@@ -35,38 +36,28 @@ class Choice:
 
 @dataclass
 class Config:
-    """What `conf/` composes; env and algorithm are checked by their own classes."""
+    """What `conf/` composes; sections of type Any are checked by their own classes."""
 
     env: Any = MISSING
     algorithm: Any = MISSING
     curriculum: Choice = field(default_factory=Choice)
-    boosting: Choice = field(default_factory=Choice)
-    transfer: Choice = field(default_factory=Choice)
+    boosting: Any = MISSING
+    transfer: Any = MISSING
     scale: Scale = field(default_factory=Scale)
     seeds: Seeds = field(default_factory=Seeds)
     workers: int = 1
     threads: int | None = None
+    device: str = "cpu"
     runs_dir: str = "runs"
     tag: str | None = None
     progress: str = "auto"
 
 
 #: Keys that don't belong to a configuration's identity: they change no number.
-OUTPUT_KEYS = ("seeds", "workers", "threads", "runs_dir", "tag", "progress")
-
-
-@dataclass(frozen=True)
-class FQISettings:
-    """`conf/algorithm/fqi.yaml`; a budget is one value or a list with one a task."""
-
-    name: str
-    iterations: Any
-    episodes: Any
-    epsilon: Any
-    new_data: str
-    dataset: str
-    fit_randomness: str
-    regressor: dict
+OUTPUT_KEYS = (
+    *("seeds", "workers", "threads", "device"),
+    *("runs_dir", "tag", "progress"),
+)
 
 
 def register() -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+TIE = 1e-9  # distances between actions that differ by less are equal
+
 
 def greedy(q: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.intp]:
     """The best action of q (..., A); ties are broken uniformly by u (...) in [0, 1)."""
@@ -16,3 +18,23 @@ def greedy(q: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.intp]:
 def uniform(n_actions: int, u: NDArray[np.float64]) -> NDArray[np.intp]:
     """A uniformly random action from each u (...) in [0, 1)."""
     return (u * n_actions).astype(np.intp)
+
+
+def annealed(step: int, first: float, last: float, over: int) -> float:
+    """ε at a step, falling in a straight line from `first` to `last` over `over`."""
+    return last if step >= over else first + (last - first) * step / over
+
+
+def combined(actions: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Residual policy's table (A, A): what is done for (prior's action, own action).
+
+    The action of `actions` (A, k) nearest to their sum; the own one if they cancel,
+    and among equally near ones the one nearest to the own (paper, C.3).
+    """
+    aim = actions[:, None] + actions[None]
+    off = np.linalg.norm(aim[:, :, None] - actions, axis=-1)
+    from_own = np.linalg.norm(actions[:, None] - actions, axis=-1)
+    near = off <= off.min(-1, keepdims=True) + TIE
+    table = np.where(near, from_own[None], np.inf).argmin(-1)
+    own = np.broadcast_to(np.arange(len(actions)), table.shape)
+    return np.where(np.linalg.norm(aim, axis=-1) < TIE, own, table)

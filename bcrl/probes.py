@@ -1,10 +1,11 @@
-"""Metrics: what is measured after each iteration, in the task being trained."""
+"""Metrics: what is measured after each FQI iteration, in the task being trained."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 from bcrl import oracle
 from bcrl.envs import Env
 from bcrl.errors import BcrlError, ConfigError, did_you_mean
-from bcrl.learners.fqi import Snapshot
-from bcrl.rollout import Episodes, draws, rollout
+from bcrl.learners.fqi import Iteration
+from bcrl.q import Values
+from bcrl.rollout import draws, rollout
 from bcrl.streams import stream
 
 
@@ -73,13 +75,21 @@ def check(metrics: Sequence[str], target: Env) -> None:
         raise ConfigError("env.metrics", "q_error_start", why)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Probe:
     """Measures snapshots of several seeds; draws from the evaluation streams only."""
 
     seeds: Sequence[int]
-    target: Env
+    tasks: Sequence[Env]
     metrics: Sequence[str]
+    _residuals: list[Values] = field(default_factory=list)  # at the end of each stage
+
+    index: ClassVar[str] = "iteration"  # what a snapshot's count is
+
+    @property
+    def target(self) -> Env:
+        """The task that is to be solved in the end."""
+        return self.tasks[-1]
 
     @cached_property
     def states(self) -> NDArray[np.float64]:
@@ -95,18 +105,18 @@ class Probe:
         at = np.flatnonzero((known.states == start).all(-1))
         return float(known.q[at[0]].max()) if len(at) else None
 
-    def measure(self, snapshot: Snapshot) -> tuple[list[dict[str, float]], Episodes]:
-        """Each seed's metrics, and the greedy episodes behind them."""
+    def measure(self, snapshot: Iteration) -> list[dict[str, float]]:
+        """Each seed's metrics."""
         env = snapshot.stage.env
         start = env.evaluation_states()
         u = np.stack(
             [
-                draws(stream(seed, "evaluation", snapshot.iteration), env, len(start))
+                draws(stream(seed, "evaluation", snapshot.count), env, len(start))
                 for seed in self.seeds
             ]
         )
         everyone = np.broadcast_to(start, (len(self.seeds), *start.shape))
-        episodes = rollout(env, snapshot.q, everyone, u)
+        episodes = rollout(env, snapshot.learned.q, everyone, u)
         returns, solved = episodes.discounted_return(env.gamma), episodes.solved()
         start_rows, rows, q_star = _layout(env, self.target)
         views = (
@@ -122,9 +132,34 @@ class Probe:
             )
             for s in range(len(self.seeds))
         )
-        return [
-            {m: float(METRICS[m](v)) for m in self.metrics} for v in views
-        ], episodes
+        if snapshot.last_of_stage:
+            self._residuals.append(snapshot.probed_residual)
+            self._last = snapshot, episodes
+        return [{m: float(METRICS[m](v)) for m in self.metrics} for v in views]
+
+    def arrays(self, s: int) -> dict[str, NDArray]:
+        """What seed number s ends with: Q and residuals at the probed states."""
+        snapshot, episodes = self._last
+        found = {
+            "states": self.states,
+            "q": snapshot.probed_q[s],
+            "residuals": np.stack([each[s] for each in self._residuals]),
+        }
+        if episodes.length.shape[1] == 1:  # one evaluation episode: keep its path
+            found["trajectory"] = episodes.state[s, 0, : episodes.length[s, 0] + 1]
+        return found | scene(self.tasks)
+
+    def facts(self) -> dict[str, Any]:
+        """What else is known of the run."""
+        return {"optimum": self.optimum}
+
+
+def scene(tasks: Sequence[Env]) -> dict[str, NDArray]:
+    """What a figure needs to draw the tasks, as far as they say."""
+    target = tasks[-1]
+    if hasattr(target, "walls"):
+        return {"walls": np.stack([task.walls for task in tasks]), "goal": target.goal}
+    return target.scene() if hasattr(target, "scene") else {}
 
 
 @lru_cache(maxsize=64)

@@ -12,11 +12,11 @@ from tqdm import tqdm
 
 @dataclass(frozen=True)
 class Tick:
-    """One iteration done by a group of seeds."""
+    """How far a group of seeds is."""
 
     seeds: tuple[int, ...]
     task: int
-    iteration: int
+    count: int  # iterations or steps done
     last_of_stage: bool
 
 
@@ -24,12 +24,13 @@ class Progress:
     """Shows ticks of one run; `mode` is bar, lines, none or auto."""
 
     def __init__(
-        self, name: str, seeds: Sequence[int], iterations: int, mode: str
+        self, name: str, seeds: Sequence[int], length: int, unit: str, mode: str
     ) -> None:
         if mode == "auto":
             mode = "bar" if sys.stderr.isatty() else "lines"
-        self.name, self.iterations, self.mode = name, iterations, mode
-        self.done, self.total = 0, len(seeds) * iterations
+        self.name, self.length, self.unit, self.mode = name, length, unit, mode
+        self.done, self.total = 0, len(seeds) * length
+        self._counts: dict[tuple[int, ...], int] = {}
         self.began = time.monotonic()
         shape = "{desc} |{bar}| {percentage:3.0f}% {elapsed}, {remaining} to go"
         self.bar = (
@@ -39,16 +40,18 @@ class Progress:
         )
 
     def tick(self, tick: Tick) -> None:
-        """Count one iteration of a group."""
-        self.done += len(tick.seeds)
+        """Count what a group has done since its last tick."""
+        new = len(tick.seeds) * (tick.count - self._counts.get(tick.seeds, 0))
+        self._counts[tick.seeds] = tick.count
+        self.done += new
         where = (
-            f"{self.name} · T{tick.task} · iteration {tick.iteration}/{self.iterations}"
+            f"{self.name} · T{tick.task} · {self.unit} {tick.count}/{self.length}"
             f" · {_named(tick.seeds)}"
         )
         if self.bar is not None:
             self.bar.set_description_str(where, refresh=False)
-            self.bar.update(len(tick.seeds))
-        elif self.mode == "lines" and tick.last_of_stage:
+            self.bar.update(new)
+        elif self.mode == "lines" and tick.last_of_stage and self.done:
             spent = time.monotonic() - self.began
             left = spent * (self.total - self.done) / self.done
             share = self.done / self.total

@@ -22,7 +22,7 @@ from bcrl.errors import BcrlError
 from bcrl.files import write_atomically, write_text
 
 SCHEMA = 1  # raised when a file's meaning changes
-LIBRARIES = ("hydra-core", "numpy", "numba", "scikit-learn")
+LIBRARIES = ("hydra-core", "numpy", "numba", "scikit-learn", "torch")
 
 
 def check_directory(plan: Plan) -> None:
@@ -75,11 +75,15 @@ def seed_path(directory: Path, seed: int, suffix: str) -> Path:
 
 
 def is_complete(directory: Path, seed: int) -> bool:
-    """Whether this seed's metadata, written last, says that all of it is there."""
+    """Whether this seed's metadata, written last, says that all of it is there.
+
+    A seed that failed is done, too: it would fail in the same way again.
+    """
     try:
         metadata = json.loads(seed_path(directory, seed, "json").read_text())
-        complete = metadata["status"] == "complete" and metadata["schema"] == SCHEMA
-    except (OSError, ValueError, KeyError, TypeError):
+        done = metadata["status"] == "complete" or metadata["status"].startswith("fail")
+        complete = done and metadata["schema"] == SCHEMA
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return False
     files = [seed_path(directory, seed, suffix) for suffix in ("csv", "npz")]
     return complete and all(file.exists() for file in files)
@@ -88,11 +92,15 @@ def is_complete(directory: Path, seed: int) -> bool:
 def write_seed(
     plan: Plan,
     seed: int,
+    status: str,
     rows: Sequence[Mapping[str, int | float]],
     arrays: Mapping[str, NDArray],
     facts: Plain,
 ) -> None:
-    """One seed's CSV, NPZ and, last, JSON with `facts` and where it was computed."""
+    """One seed's CSV, NPZ and, last, JSON with `facts` and where it was computed.
+
+    `status` is `complete` or `failed: why`.
+    """
     directory = plan.directory
     lines = [",".join(rows[0])]
     lines += [",".join(repr(value) for value in row.values()) for row in rows]
@@ -100,7 +108,7 @@ def write_seed(
     config = plan.config
     metadata = {
         "schema": SCHEMA,
-        "status": "complete",
+        "status": status,
         "seed": seed,
         "scale": config["scale"]["name"],
         "env": plan.env,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numba
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 from bcrl.envs import Env, is_finite
 from bcrl.policies import greedy, uniform
 from bcrl.q import Q, Table
+
+CHOICES = 3  # uniforms a step-wise decision takes: explore? which action? the prior's
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,11 @@ def start_states(
     return env.initial(rng.random((episodes, env.initial_noise)))
 
 
+#: Actions (S, E) at states (S, E, d), from uniforms (S, E, 2 or more); only the lanes
+#: in the mask (S, E) count. Forces (S, E, k) go to an env's `push`.
+Policy = Callable[[NDArray, NDArray, NDArray], NDArray]
+
+
 def rollout(
     env: Env,
     q: Q,
@@ -62,26 +70,42 @@ def rollout(
     """ε-greedy episodes from start (S, E, d) with uniforms u (S, T, E, 2 + noise)."""
     if is_finite(env) and isinstance(q, Table):
         return _tabular_rollout(env, q, start, u, epsilon)
+
+    def epsilon_greedy(now: NDArray, u: NDArray, alive: NDArray) -> NDArray:
+        act = uniform(env.n_actions, u[..., 1])
+        exploit = alive & (u[..., 0] >= epsilon)
+        if exploit.any():  # Q may be dear: ask it only where it decides
+            asked = [x[lanes] for x, lanes in zip(now, exploit, strict=True)]
+            values = np.concatenate(q(asked, env.n_actions))
+            act[exploit] = greedy(values, u[..., 1][exploit])
+        return act
+
+    return play(env, epsilon_greedy, start, u)
+
+
+def play(
+    env: Env, policy: Policy, start: NDArray[np.float64], u: NDArray[np.float64]
+) -> Episodes:
+    """Episodes from start (S, E, d); the last of u (S, T, E, …) are the env's noise."""
     n_seeds, n_episodes, d = start.shape
-    horizon = u.shape[1]
+    horizon, noise = u.shape[1], u.shape[-1] - env.step_noise
     state = np.zeros((n_seeds, n_episodes, horizon + 1, d))
     state[:, :, 0] = start
-    action = np.zeros((n_seeds, n_episodes, horizon), np.intp)
+    action = None
     reward = np.zeros((n_seeds, n_episodes, horizon))
     absorbing = np.zeros((n_seeds, n_episodes, horizon), bool)
     length = np.zeros((n_seeds, n_episodes), np.intp)
     alive = np.ones((n_seeds, n_episodes), bool)
     for t in range(horizon):
         now = state[:, :, t]
-        act = uniform(env.n_actions, u[:, t, :, 1])
-        exploit = alive & (u[:, t, :, 0] >= epsilon)
-        if exploit.any():
-            asked = [now[s, exploit[s]] for s in range(n_seeds)]
-            values = np.concatenate(q(asked, env.n_actions))
-            act[exploit] = greedy(values, u[:, t, :, 1][exploit])
+        act = policy(now, u[:, t], alive)
+        if action is None:
+            shape = (n_seeds, n_episodes, horizon, *act.shape[2:])
+            action = np.zeros(shape, act.dtype)
+            step = env.push if act.dtype == np.float64 else env.step
         length[alive] += 1
         action[:, :, t] = act
-        after, r, done = env.step(now[alive], act[alive], u[:, t, :, 2:][alive])
+        after, r, done = step(now[alive], act[alive], u[:, t, :, noise:][alive])
         state[:, :, t + 1] = now
         state[alive, t + 1], reward[alive, t], absorbing[alive, t] = after, r, done
         alive[alive] = ~done

@@ -16,9 +16,11 @@ import numpy as np
 
 from bcrl import oracle, records
 from bcrl.compose import Plan
-from bcrl.learners.fqi import FQI
+from bcrl.evaluation import StepProbe
 from bcrl.probes import Probe
 from bcrl.progress import Progress, Tick
+from bcrl.stage import Team
+from bcrl.transfer import begin
 
 Seeds = tuple[int, ...]
 
@@ -32,10 +34,12 @@ def run(plan: Plan) -> None:
         print(f"{name}: {skipped} of {len(plan.seeds)} seeds complete", file=sys.stderr)
     if not pending:
         return
-    if any(metric.startswith("q_error") for metric in plan.metrics):
+    measured = plan.metrics if plan.family == "FQI" else ()
+    if any(metric.startswith("q_error") for metric in measured):
         for task in dict.fromkeys((plan.target, *(s.env for s in plan.stages))):
             oracle.reference(task)  # searched for once, here, and kept on disk
-    progress = Progress(name, pending, plan.iterations, plan.config["progress"])
+    unit = _probe(plan, ()).index
+    progress = Progress(name, pending, plan.length, unit, plan.config["progress"])
     try:
         _train(plan, _groups(plan, pending), progress.tick)
     finally:
@@ -45,7 +49,7 @@ def run(plan: Plan) -> None:
 def _groups(plan: Plan, seeds: list[int]) -> list[Seeds]:
     """Seeds that train together: at most as allowed, spread evenly over the workers."""
     workers = min(plan.config["workers"], len(seeds))
-    rounds = -(-len(seeds) // (plan.config["seeds"]["lockstep"] * workers))
+    rounds = -(-len(seeds) // (plan.lockstep * workers))
     groups = min(rounds * workers, len(seeds))
     return [tuple(part.tolist()) for part in np.array_split(seeds, groups)]
 
@@ -116,41 +120,36 @@ def train_group(
     origin: which code and machine, as `records.provenance` says.
     """
     wall, cpu = time.perf_counter(), time.process_time()
-    learner = FQI(
-        seeds,
-        plan.regressor,
-        plan.transfer,
-        plan.shared_data,
-        plan.fixed_trees,
-        threads,
-    )
-    probe = Probe(seeds, plan.target, plan.metrics)
+    probe = _probe(plan, seeds)
+    team = Team(seeds, probe.states, threads, plan.device)
     rows: list[list[dict]] = [[] for _ in seeds]
-    residuals: list[list[np.ndarray]] = [[] for _ in seeds]
-    for now in learner.run(plan.stages, probe.states):
-        measured, episodes = probe.measure(now)
-        where = {"stage": now.stage.number, "task": now.stage.task}
-        for s, metrics in enumerate(measured):
-            rows[s].append({**where, "iteration": now.iteration, **metrics})
-            if now.last_of_stage:
-                residuals[s].append(now.probed_residual[s])
-        tick(Tick(seeds, now.stage.task, now.iteration, now.last_of_stage))
-    facts = {
-        "optimum": probe.optimum,
+    failed: dict[int, str] = {}
+    learned = None
+    for stage in plan.stages:
+        start = begin(stage.transfers, learned)
+        for now in stage.learner.learn(stage, start, team):
+            where = {"stage": stage.number, "task": stage.task, probe.index: now.count}
+            for s, metrics in enumerate(probe.measure(now)):
+                if s not in failed:  # its last row is the one that shows the failure
+                    rows[s].append(where | metrics)
+            for s, why in getattr(now, "failed", {}).items():
+                failed.setdefault(s, f"{why} at {probe.index} {now.count}")
+            tick(Tick(seeds, stage.task, now.count, now.last_of_stage))
+        learned = now.learned
+    facts = probe.facts() | {
         "wall_seconds": time.perf_counter() - wall,
         "cpu_seconds": (time.process_time() - cpu) / len(seeds),  # this seed's share
         "lockstep": list(seeds),
         "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
     for s, seed in enumerate(seeds):
-        arrays = {
-            "states": probe.states,
-            "q": now.probed_q[s],
-            "residuals": np.stack(residuals[s]),
-        }
-        if episodes.length.shape[1] == 1:  # one evaluation episode: keep its path
-            arrays["trajectory"] = episodes.state[s, 0, : episodes.length[s, 0] + 1]
-        if hasattr(plan.target, "walls"):  # what a figure needs to draw the tasks
-            arrays["walls"] = np.stack([task.walls for task in plan.tasks])
-            arrays["goal"] = plan.target.goal
-        records.write_seed(plan, seed, rows[s], arrays, facts | origin)
+        status = f"failed: {failed[s]}" if s in failed else "complete"
+        if s in failed:
+            print(f"{plan.env} {plan.name}: seed {seed} {status}", file=sys.stderr)
+        records.write_seed(plan, seed, status, rows[s], probe.arrays(s), facts | origin)
+
+
+def _probe(plan: Plan, seeds: Seeds) -> Probe | StepProbe:
+    if plan.family == "DQN":
+        return StepProbe(seeds, plan.tasks)
+    return Probe(seeds, plan.tasks, plan.metrics)

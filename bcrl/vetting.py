@@ -28,6 +28,12 @@ CONF = next(p for p in (PACKAGE / "conf", PACKAGE.parent / "conf") if p.is_dir()
 CONFIG_NAME = "config"
 #: The choices that make a variant; a run is compared with these at their defaults.
 VARIANT_GROUPS = ("env", "algorithm", "curriculum", "boosting", "transfer", "scale")
+#: The options that follow the authors' code, and the tag of runs that choose them all.
+RELEASED = "released"
+RELEASED_OPTIONS = {
+    ("boosting", "on"): "released",
+    ("transfer", "shaping"): "shaping_released",
+}
 Folders = tuple[str, ...]  # of configs, besides our own
 
 
@@ -101,23 +107,28 @@ def plan(
         if choices.get(group) is None:
             raise BcrlError(f"{group}: every run needs a choice of it")
     extra = tuple(f for f in folders if Path(f) != CONF)
-    config = _plain(composed)
-    variant = (f"env={choices['env']}", *_usual(config, choices))
-    return compose.plan(
-        config, _plain(_compose(CONFIG_NAME, variant, extra)), choices["env"]
-    )
+    known = {}
+    for tag, released in ((None, False), (RELEASED, True)):
+        variant = (
+            f"env={choices['env']}",
+            *_usual(_plain(composed), choices, released),
+        )
+        known[tag] = _plain(_compose(CONFIG_NAME, variant, extra))
+    return compose.plan(_plain(composed), known, choices["env"])
 
 
-def _usual(config: Plain, choices: Mapping[str, str]) -> Iterator[str]:
+def _usual(config: Plain, choices: Mapping[str, str], released: bool) -> Iterator[str]:
     """The shipped choices that this config is a case of, by its components' names.
 
     A user's option `big` that is named fqi is thus compared with our fqi, and a
-    curriculum of any other name with `curriculum=on`.
+    curriculum of any other name with `curriculum=on`. `released`: with the authors'
+    code's reading of each component, where we ship one.
     """
     for group in VARIANT_GROUPS[1:]:
         name = config[group].get("name")
         if group in ("curriculum", "boosting"):
             name = "off" if name == "off" else "on"
+        name = RELEASED_OPTIONS.get((group, name), name) if released else name
         shipped = (CONF / group / f"{name}.yaml").exists()
         yield f"{group}={name if shipped else choices[group]}"
 

@@ -22,6 +22,7 @@ class Env(Protocol):
     state_dim: ClassVar[int]
     initial_noise: ClassVar[int]  # uniforms that `initial` takes a state
     step_noise: ClassVar[int]  # uniforms that `step` takes a state
+    actions: ClassVar[NDArray[np.float64]]  # (A, k) what each action does, as a vector
     gamma: float  # discount factor
     horizon: int  # steps after which an episode is cut (not absorbing)
 
@@ -38,6 +39,22 @@ class Env(Protocol):
 
     def evaluation_states(self) -> NDArray[np.float64]:
         """States (n, d) from which the greedy policy is evaluated."""
+
+
+class ContinuousEnv(Env, Protocol):
+    """An env that takes any vector as its action; LSPI learns in its LQ tasks."""
+
+    @property
+    def linear_quadratic(self) -> tuple[NDArray[np.float64], ...] | None:
+        """A, B, Q, R of s' = A s + B a, reward −s'ᵀ Q s' − aᵀ R a; None if not so."""
+
+    def push(
+        self,
+        state: NDArray[np.float64],
+        force: NDArray[np.float64],
+        noise: NDArray[np.float64],
+    ) -> Step:
+        """`step` with actions (..., k)."""
 
 
 class FiniteEnv(Env, Protocol):

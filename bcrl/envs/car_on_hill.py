@@ -53,6 +53,7 @@ class CarOnHill:
     state_dim: ClassVar[int] = 2
     initial_noise: ClassVar[int] = 0
     step_noise: ClassVar[int] = 0
+    actions: ClassVar[NDArray[np.float64]] = np.array([[-FORCE], [FORCE]])
 
     def __post_init__(self) -> None:
         if not 0.0 < self.mass < math.inf:

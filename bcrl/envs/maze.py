@@ -62,6 +62,7 @@ class Maze:
     state_dim: ClassVar[int] = 2
     initial_noise: ClassVar[int] = 0
     step_noise: ClassVar[int] = 0
+    actions: ClassVar[NDArray[np.float64]] = MOVES
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.height < 1.0:

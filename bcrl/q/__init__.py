@@ -9,20 +9,31 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-Values = list[NDArray[np.float64]]
+Values = Sequence[NDArray[np.float64]]
 
 
 class Q(Protocol):
-    """Q-functions of S seeds; seed s is asked at its own states."""
+    """Q-functions of S seeds; seed s is asked at its own states.
+
+    S arrays may be one stacked array (S, n, d); the values are stacked then, too.
+    """
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         """Action values, S arrays (n_s, A), at S arrays of states (n_s, d)."""
+
+
+def each(states: Sequence[NDArray], values: Callable[[int], NDArray]) -> Values:
+    """`values(s)` for every seed, stacked if the states are."""
+    found = [values(s) for s in range(len(states))]
+    return np.stack(found) if isinstance(states, np.ndarray) else found
 
 
 class Zero:
     """Q = 0: what an unfitted approximator predicts."""
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        if isinstance(states, np.ndarray):
+            return np.zeros((*states.shape[:-1], n_actions))
         return [np.zeros((len(x), n_actions)) for x in states]
 
 
@@ -38,8 +49,24 @@ class Sum:
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         total, *rest = (term(states, n_actions) for term in self.terms)
         for values in rest:
-            total = [a + b for a, b in zip(total, values, strict=True)]
+            if isinstance(states, np.ndarray):
+                total = total + values
+            else:
+                total = [a + b for a, b in zip(total, values, strict=True)]
         return total
+
+
+@dataclass(frozen=True)
+class Raised:
+    """Q(s, a) + max_a' potential(s, a'): undoes what shaping with it took off."""
+
+    q: Q
+    potential: Q
+
+    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        values = self.q(states, n_actions)
+        lift = self.potential(states, n_actions)
+        return each(states, lambda s: values[s] + lift[s].max(-1, keepdims=True))
 
 
 def add(base: Q, residual: Q) -> Q:
@@ -58,7 +85,7 @@ class Table:
     index: Callable[[NDArray[np.float64]], NDArray[np.intp]]
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        return [q[self.index(x)] for q, x in zip(self.values, states, strict=True)]
+        return each(states, lambda s: self.values[s][self.index(states[s])])
 
 
 @dataclass(frozen=True)
@@ -81,4 +108,4 @@ class Fits:
         )
         for (s, a), values in zip(cells, found, strict=True):
             out[s][:, a] = values
-        return out
+        return np.stack(out) if isinstance(states, np.ndarray) else out

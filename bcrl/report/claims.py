@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.report.load import METHODS, Variant
 from bcrl.report.statistics import row_deviation
+from bcrl.report.variants import METHODS, Variant
 from bcrl.report.verdicts import (
     Claim,
     Measured,

@@ -7,23 +7,30 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import pandas as pd
 from matplotlib.figure import Figure
 
 from bcrl import __version__
 from bcrl.errors import BcrlError
 from bcrl.files import write_text
 from bcrl.report import style
+from bcrl.report.curves import LINEAR, figure_methods
 from bcrl.report.document import claims_report
 from bcrl.report.figures import figure_1, figure_2, figure_5
-from bcrl.report.load import Runs, load_runs
+from bcrl.report.linear_figures import figure_4a, figure_4b
+from bcrl.report.load import load_runs
 from bcrl.report.maze_figure import figure_3
+from bcrl.report.sweeps import groups, sweep_report, sweep_table
 from bcrl.report.tables import aggregate
+from bcrl.report.variants import Runs
 
 #: figure → environment, experiment that makes its runs, method it cannot do without
 FIGURES: dict[str, tuple[str, str, str | None, Callable[..., Figure]]] = {
     "1": ("car_on_hill", "fig1", None, figure_1),
     "2": ("maze", "fig2", None, figure_2),
     "3": ("maze", "fig2", None, figure_3),
+    "4a": (LINEAR, "fig4", None, figure_4a),
+    "4b": (LINEAR, "fig4", None, figure_4b),
     "5": ("maze", "fig2", "BC-FQI", figure_5),
 }
 
@@ -66,7 +73,8 @@ def report(
     files, skipped = [], []
     for name in figures:
         env, experiment, needed, draw = FIGURES[name]
-        methods = runs.methods(env, tag)
+        linear = env == LINEAR
+        methods = figure_methods(runs, tag) if linear else runs.methods(env, tag)
         if not methods or (needed and needed not in methods):
             lacking = f"{env}/{needed or '*'}{tagged}"
             remedy = f"`bcrl experiment={experiment} scale={runs.scale}` makes them"
@@ -78,10 +86,22 @@ def report(
         with style.sheet():
             title = f"Klink et al. (2022), figure {name}, reproduced: {suffix}"
             files += style.save(draw(runs, tag), out, f"figure_{name}_{suffix}", title)
-    table = aggregate(runs).to_csv(index=False, lineterminator="\n")
-    files.append(write_text(out / f"aggregate_{runs.scale}.csv", table))
+    families = {variant.family for variant in runs.variants}
+    for family, stem in (("FQI", "aggregate"), ("DQN", "aggregate_dqn")):
+        if family in families:
+            table = aggregate(runs, family)
+            files.append(_write_csv(out / f"{stem}_{runs.scale}.csv", table))
     files.append(write_text(out / f"claims_{suffix}.md", claims_report(runs, tag)))
+    if compared := groups(runs):
+        text = sweep_report(runs, compared)
+        files.append(write_text(out / f"sweep_{runs.scale}.md", text))
+        table = sweep_table(compared)
+        files.append(_write_csv(out / f"sweep_{runs.scale}.csv", table))
     return files, skipped
+
+
+def _write_csv(path: Path, table: pd.DataFrame) -> Path:
+    return write_text(path, table.to_csv(index=False, lineterminator="\n"))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -6,8 +6,11 @@ from collections import Counter
 from collections.abc import Mapping
 
 from bcrl.report.claims import car_claims, maze_claims
-from bcrl.report.load import Runs, Variant
+from bcrl.report.curves import linear_methods
+from bcrl.report.linear_claims import LATE, late_table, linear_claims
+from bcrl.report.notes import Note, tags_shown
 from bcrl.report.tables import final_table, markdown, stage_table
+from bcrl.report.variants import Runs, Variant
 from bcrl.report.verdicts import FEWEST_SEEDS
 
 HEADER = (
@@ -50,11 +53,31 @@ def claims_report(runs: Runs, tag: str | None = None) -> str:
         parts.append(final_table(methods))
         parts.extend(_by_stage(methods))
         parts.append(_cost(methods))
-    notes = [f"- {note.text}" for note in runs.notes if note.tag == tag]
+    linear = linear_methods(runs, tag)
+    parts.extend(_linear_section(linear))
+    notes = [f"- {n.text}" for n in runs.notes if n.tag == tag or _stands_in(n, linear)]
     if notes:
         parts.append("## Notes on the runs\n")
         parts.append("\n".join(notes) + "\n")
     return "\n".join(parts)
+
+
+def _linear_section(methods: Mapping[str, Variant]) -> list[str]:
+    """The DQN family's claims and values, with who is of which tag."""
+    parts = ["## Linear system (§6.3 and C.3, Fig. 4)\n"]
+    if not methods:
+        return [*parts, "No runs.\n"]
+    if len({variant.tag for variant in methods.values()}) > 1:
+        parts.append(f"{tags_shown(methods)}; the others are untagged.\n")
+    rows = [claim.row(methods) for claim in linear_claims()]
+    parts += [_tally([row[-1] for row in rows]), markdown(HEADER, rows), LATE]
+    return [*parts, late_table(methods), _cost(methods)]
+
+
+def _stands_in(note: Note, linear: Mapping[str, Variant]) -> bool:
+    """Whether a note is about an untagged run that stands beside tagged ones."""
+    variant = linear.get(note.method or "")
+    return variant is not None and (note.env, note.tag) == (variant.env, variant.tag)
 
 
 def _tally(verdicts: list[str]) -> str:

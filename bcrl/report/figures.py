@@ -9,12 +9,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bcrl.report import style
-from bcrl.report.load import Runs, Variant
+from bcrl.report.notes import remarks, tags_shown
 from bcrl.report.statistics import mean, standard_error
+from bcrl.report.variants import Runs, Variant
 
 FOOTER_WIDTH = 20  # characters of small print to an inch
 
-ENV_TITLES = {"car_on_hill": "Car on the hill", "maze": "Maze"}
+ENV_TITLES = {
+    "car_on_hill": "Car on the hill",
+    "maze": "Maze",
+    "linear_system": "Linear system",
+}
 
 
 def small_print(
@@ -29,23 +34,19 @@ def small_print(
     `width` of the figure in inches; `compares`: notes on differences between methods
     belong to it.
     """
-    env, tag = next((v.env, v.tag) for v in methods.values())
+    env = next(v.env for v in methods.values())
     counts = {name: len(v.seeds) for name, v in methods.items()}
     if len(set(counts.values())) == 1:
         n = next(iter(counts.values()))
         seeds = f"{n} seed{'s' * (n != 1)}{' per method' * (len(counts) > 1)}"
     else:
         seeds = "seeds " + ", ".join(f"{name} {n}" for name, n in counts.items())
-    tagged = f" · variants @{tag}" if tag else ""
+    tags = tags_shown(methods)
+    tagged = f" · {tags}" if tags else ""
     lines = [f"{ENV_TITLES[env]} · scale {runs.scale} · {seeds}{tagged} · {what}"]
-    shown = {*methods, None} if compares else set(methods)
-    remarks = [
-        note.footer
-        for note in runs.notes
-        if note.footer and (note.env, note.tag) == (env, tag) and note.method in shown
-    ]
-    if remarks:
-        lines.append("Note: " + "; ".join(remarks))
+    odd = remarks(runs.notes, methods, compares)
+    if odd:
+        lines.append("Note: " + "; ".join(odd))
     limit = int(width * FOOTER_WIDTH)
     return [part for line in lines for part in textwrap.wrap(line, limit)]
 
@@ -61,7 +62,7 @@ def _mean_bands(axes: Axes, methods: Mapping[str, Variant], metric: str) -> None
     for name, variant in methods.items():
         values = variant.metrics[metric]
         half = 2 * standard_error(values)
-        style.band(axes, variant.iterations, mean(values), half, name)
+        style.band(axes, variant.index, mean(values), half, name)
 
 
 def _panels(
@@ -86,7 +87,7 @@ def figure_1(runs: Runs, tag: str | None = None) -> Figure:
     for axes, metric in zip(panels, ("q_error", "return"), strict=True):
         for name, variant in methods.items():
             axes.plot(
-                variant.iterations,
+                variant.index,
                 variant.metrics[metric].T,
                 color=style.colour(name),
                 linewidth=0.5,
@@ -95,9 +96,7 @@ def figure_1(runs: Runs, tag: str | None = None) -> Figure:
             )
         for name, variant in methods.items():
             centre = mean(variant.metrics[metric])
-            axes.plot(
-                variant.iterations, centre, color=style.colour(name), linewidth=2.0
-            )
+            axes.plot(variant.index, centre, color=style.colour(name), linewidth=2.0)
     style.legend(figure, methods)
     what = "bold: mean over seeds, dashed: single seeds"
     style.footer(figure, small_print(runs, methods, what, style.WIDTH))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,79 +13,45 @@ from numpy.typing import NDArray
 
 from bcrl.errors import BcrlError
 from bcrl.report.notes import Note, across_methods, compared, listed
-from bcrl.report.seedfiles import INDEX, read_arrays, read_csv, read_sidecar
+from bcrl.report.seedfiles import INDEX, family_of, read_csv, read_sidecar
+from bcrl.report.variants import DQN_METHODS, METHODS, Runs, Variant
 
-#: What an environment's CSVs hold after the index columns; others may hold anything.
+#: What FQI's CSVs of an environment hold after the index columns; others may hold
+#: anything.
 METRICS = {
     "car_on_hill": ("q_error", "return"),
     "maze": ("return", "q_error_start", "q_error", "residual_start", "solved"),
 }
 
+#: What the DQN family's CSVs hold after the index columns, in every environment.
+DQN_METRICS = (
+    *("return", "discounted_return", "success_rate", "q_mean", "loss"),
+    *("greedy_return", "greedy_discounted_return", "greedy_success_rate"),
+)
+#: Columns of these that are nan wherever there was nothing to average.
+MAY_BE_NAN = {"FQI": (), "DQN": ("q_mean", "loss")}
+
+#: The methods that the figures compare: what is absent of them gets a note.
+COMPARED = {
+    ("car_on_hill", "FQI"): METHODS,
+    ("maze", "FQI"): METHODS,
+    ("linear_system", "DQN"): tuple(
+        name for name in DQN_METHODS if name not in ("B-DQN", "S-DQN", "SB-DQN")
+    ),
+}
+
 SCHEMA = 1  # of the records that this report reads
 
-#: The methods that the figures compare, in the order of the legends.
-METHODS = ("FQI", "C-FQI", "B-FQI", "BC-FQI")
 
-
-@dataclass(frozen=True)
-class Variant:
-    """All complete seeds of one variant: S seeds, I iterations common to them.
-
-    `stage` and `task` have shape (I,), 1-based; every array in `metrics` (S, I);
-    `sidecars` are the seeds' JSON documents, in the order of `seeds`.
-    """
-
-    env: str
-    method: str
-    tag: str | None
-    folder: Path
-    seeds: tuple[int, ...]
-    stage: NDArray[np.int64]
-    task: NDArray[np.int64]
-    metrics: dict[str, NDArray[np.float64]]
-    sidecars: tuple[dict[str, Any], ...]
-
-    @property
-    def name(self) -> str:
-        """The folder's name, `BC-FQI` or `BC-FQI@released`."""
-        return self.folder.name
-
-    @property
-    def iterations(self) -> NDArray[np.int64]:
-        """1, …, I."""
-        return np.arange(1, len(self.stage) + 1)
-
-    @property
-    def optimum(self) -> float | None:
-        """V*(s0) of the target task, None where it is unknown or not one number."""
-        values = {sidecar.get("optimum") for sidecar in self.sidecars}
-        (value,) = values if len(values) == 1 else (None,)
-        return None if value is None else float(value)
-
-    def arrays(self, seed: int, *names: str) -> list[NDArray[np.float64]]:
-        """The named arrays of a seed's NPZ; BcrlError if it does not hold them."""
-        return read_arrays(self.folder / f"seed_{seed:04d}.npz", *names)
-
-
-@dataclass(frozen=True)
-class Runs:
-    """One scale's variants and the notes that reading them gave rise to."""
-
-    scale: str
-    variants: tuple[Variant, ...]
-    notes: list[Note] = field(default_factory=list)
-
-    def methods(self, env: str, tag: str | None) -> dict[str, Variant]:
-        """The compared methods that are there for `env`, in the legends' order."""
-        found = {v.method: v for v in self.variants if v.env == env and v.tag == tag}
-        return {name: found[name] for name in METHODS if name in found}
-
-
-def _complete_seeds(folder: Path, env: str, tag: str | None) -> Iterator[Note | int]:
-    """The complete seeds of a variant's folder, and a note for each other one."""
+def _complete_seeds(
+    folder: Path, env: str, tag: str | None, notes: list[Note]
+) -> tuple[list[int], list[int]]:
+    """A folder's complete seeds and those that diverged; a note for each left out."""
     names = (re.fullmatch(r"seed_(\d+)\.(csv|json)", p.name) for p in folder.iterdir())
+    complete, failed = [], []
     for seed in sorted({int(match[1]) for match in names if match}):
         path = folder / f"seed_{seed:04d}.json"
+        what = "incomplete"
         if not path.exists():
             status = f"no {path.name}"
         else:
@@ -95,15 +60,16 @@ def _complete_seeds(folder: Path, env: str, tag: str | None) -> Iterator[Note | 
             if sidecar.get("schema") != SCHEMA:
                 status = f"schema {sidecar.get('schema')}, not {SCHEMA}"
         if status == "status complete":
-            yield seed
-        else:
-            yield Note(
-                f"{folder}: seed {seed} is incomplete ({status}): left out",
-                env,
-                tag,
-                footer=f"{folder.name}: seed {seed} incomplete, left out",
-                method=folder.name.partition("@")[0],
-            )
+            complete.append(seed)
+            continue
+        if status.startswith("status failed"):
+            failed.append(seed)
+            what, status = "failed", status.removeprefix("status failed").lstrip(": ")
+        text = f"{folder}: seed {seed} {'is ' * (what == 'incomplete')}{what}"
+        text += f" ({status}): left out" if status else ": left out"
+        short = f"{folder.name}: seed {seed} {what}, left out"
+        notes.append(Note(text, env, tag, short, folder.name.partition("@")[0]))
+    return complete, failed
 
 
 def _load_variant(folder: Path, env: str, notes: list[Note]) -> Variant | None:
@@ -111,28 +77,28 @@ def _load_variant(folder: Path, env: str, notes: list[Note]) -> Variant | None:
     method, _, tag_text = folder.name.partition("@")
     tag = tag_text or None
     tables: dict[int, pd.DataFrame] = {}
-    for seed in _complete_seeds(folder, env, tag):
-        if isinstance(seed, Note):
-            notes.append(seed)
-            continue
+    complete, failed = _complete_seeds(folder, env, tag, notes)
+    for seed in complete:
         path = folder / f"seed_{seed:04d}.csv"
         table = read_csv(path)
         header = ",".join(table.columns)
-        wanted = (*INDEX, *METRICS.get(env, ()))
+        family = family_of(table)
+        known = DQN_METRICS if family == "DQN" else METRICS.get(env)
+        wanted = (*INDEX[family], *(known or ()))
         missing = [name for name in wanted if name not in table]
         if missing:
             text = f"{path}: header is {header}; no {listed(missing)}: left out"
             short = f"{folder.name}: seed {seed} lacks columns, left out"
             notes.append(Note(text, env, tag, short, method))
             continue
-        if env in METRICS and tuple(table.columns) != wanted:
+        if known and tuple(table.columns) != wanted:
             text = f"{path}: header is {header}, expected {','.join(wanted)}"
             notes.append(Note(text, env, tag))
         tables[seed] = table
     if not tables:
         notes.append(Note(f"{folder}: no complete seed", env, tag))
         return None
-    return _assemble(folder, env, method, tag, tables, notes)
+    return _assemble(folder, env, method, tag, tables, tuple(failed), notes)
 
 
 def _assemble(
@@ -141,23 +107,26 @@ def _assemble(
     method: str,
     tag: str | None,
     tables: dict[int, pd.DataFrame],
+    failed: tuple[int, ...],
     notes: list[Note],
 ) -> Variant:
-    """Stack the seeds' tables, cut to the iterations that all of them have."""
-    lengths = {seed: len(table) for seed, table in tables.items()}
-    if len(set(lengths.values())) > 1:
-        groups = compared({f"seed {seed}": n for seed, n in lengths.items()})
-        text = f"{folder}: iterations differ between seeds ({groups}): cut to the least"
-        short = f"{folder.name}: cut to {min(lengths.values())} common iterations"
-        notes.append(Note(text, env, tag, short, method))
-    rows = min(lengths.values())
+    """Stack the seeds' tables, cut to the rows that all of them have."""
     first, *others = tables
     reference = tables[first]
+    family = family_of(reference)
+    *_, counter = INDEX[family]
+    lengths = {seed: len(table) for seed, table in tables.items()}
+    rows = min(lengths.values())
+    if len(set(lengths.values())) > 1:
+        unit = "iterations" if family == "FQI" else "evaluations"
+        groups = compared({f"seed {seed}": n for seed, n in lengths.items()})
+        text = f"{folder}: {unit} differ between seeds ({groups}): cut to the least"
+        short = f"{folder.name}: cut to {rows} common {unit}"
+        notes.append(Note(text, env, tag, short, method))
     for seed in others:
-        for column in ("stage", "task"):
-            if not np.array_equal(
-                tables[seed][column][:rows], reference[column][:rows]
-            ):
+        for column in INDEX[family]:
+            ours, theirs = tables[seed].get(column), reference[column]
+            if ours is None or not np.array_equal(ours[:rows], theirs[:rows]):
                 raise BcrlError(
                     f"{folder}: seed_{seed:04d}.csv has another {column} column than "
                     f"seed_{first:04d}.csv, so the folder mixes two configurations: "
@@ -167,29 +136,36 @@ def _assemble(
     metrics = {
         str(c): np.stack([t[c].to_numpy()[:rows] for t in tables.values()])
         for c in shared
-        if c not in INDEX
+        if c not in INDEX[family]
     }
     for name, values in metrics.items():
         bad = [s for s, row in zip(tables, values, strict=True) if _bad(row)]
-        if bad:
+        if bad and name not in MAY_BE_NAN[family]:
             text = f"{folder}: {name} has non-finite values in seed {listed(bad)}"
             short = f"{folder.name}: non-finite {name}, gaps in its mean"
             notes.append(Note(text, env, tag, short, method))
-            values[~np.isfinite(values)] = np.nan  # a gap, not a line to infinity
+        values[~np.isfinite(values)] = np.nan  # a gap, not a line to infinity
     sidecars = tuple(
         read_sidecar(folder / f"seed_{seed:04d}.json", seed) for seed in tables
     )
     notes.extend(_mixed_code(folder, env, tag, sidecars))
+    stage, task, index = (
+        reference[column].to_numpy()[:rows].astype(np.int64)
+        for column in ("stage", "task", counter)
+    )
     return Variant(
         env=env,
         method=method,
         tag=tag,
+        family=family,
         folder=folder,
         seeds=tuple(tables),
-        stage=reference["stage"].to_numpy()[:rows].astype(np.int64),
-        task=reference["task"].to_numpy()[:rows].astype(np.int64),
+        stage=stage,
+        task=task,
+        index=index,
         metrics=metrics,
         sidecars=sidecars,
+        failed=failed,
     )
 
 
@@ -232,13 +208,16 @@ def load_runs(runs_dir: Path, scale: str) -> Runs:
         raise BcrlError(
             f"no complete runs under {root}{seen}{there}: "
             f"`bcrl experiment=fig1 scale={scale}` makes those of figure 1, "
-            "experiment=fig2 those of figures 2, 3 and 5"
+            "experiment=fig2 those of figures 2, 3 and 5, experiment=fig4 those of "
+            "figure 4"
         )
     runs = Runs(scale, tuple(variants), notes)
-    for env in METRICS:
-        for tag in sorted({v.tag or "" for v in variants if v.env == env}):
-            methods = runs.methods(env, tag or None)
+    for (env, family), expected in COMPARED.items():
+        ours = [v for v in variants if (v.env, v.family) == (env, family)]
+        for tag in sorted({v.tag or "" for v in ours}):
+            found = runs.methods(env, tag or None, family)
+            methods = {name: found[name] for name in expected if name in found}
             # A tag may be meant for one method only, so absent ones go unmentioned.
-            expected = methods if tag else METHODS
-            notes.extend(across_methods(methods, expected, env, tag or None))
+            awaited = methods if tag else expected
+            notes.extend(across_methods(methods, awaited, env, tag or None, family))
     return runs

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,8 +12,8 @@ from numpy.typing import NDArray
 
 from bcrl.report import style
 from bcrl.report.figures import small_print
-from bcrl.report.load import METHODS, Runs, Variant
 from bcrl.report.seedfiles import unreadable
+from bcrl.report.variants import METHODS, Runs, Variant
 
 SIZE = (11.4, 4.2)  # inches
 MARGIN = 0.025  # half a lattice cell
@@ -49,10 +48,6 @@ def frame(axes: Axes, title: str) -> None:
     axes.spines[:].set_visible(True)
 
 
-def _npz(variant: Variant, seed: int) -> Path:
-    return variant.folder / f"seed_{seed:04d}.npz"
-
-
 def seed_mean_value(variant: Variant) -> tuple[NDArray, NDArray, NDArray]:
     """Lattice axes x (X,), y (Y,) and max_a of the seed-mean Q there, (X, Y).
 
@@ -64,9 +59,9 @@ def seed_mean_value(variant: Variant) -> tuple[NDArray, NDArray, NDArray]:
         x, y = np.unique(states[:, 0]), np.unique(states[:, 1])
         lattice = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
         if lattice.shape != states.shape or not np.allclose(lattice, states):
-            raise unreadable(_npz(variant, seed), "has states that are no lattice")
+            raise unreadable(variant.npz(seed), "has states that are no lattice")
         if total is not None and total.shape != q.shape:
-            raise unreadable(_npz(variant, seed), f"has a q of shape {q.shape}")
+            raise unreadable(variant.npz(seed), f"has a q of shape {q.shape}")
         total = q if total is None else total + q
     value = (total / len(variant.seeds)).max(axis=1)
     return x, y, value.reshape(len(x), len(y))
@@ -79,7 +74,7 @@ def trajectories(variant: Variant) -> list[NDArray[np.float64]]:
         (path,) = variant.arrays(seed, "trajectory")
         if path.ndim != 2 or path.shape[1] != 2 or not len(path):
             what = f"has a trajectory of shape {path.shape}, expected (L, 2)"
-            raise unreadable(_npz(variant, seed), what)
+            raise unreadable(variant.npz(seed), what)
         found.append(path)
     return found
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from bcrl.report.load import Variant
+    from bcrl.report.variants import Variant
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Note:
     """One diagnostic: `text` for the terminal, `footer` (if any) for the figures.
 
     It concerns the figures of `env` that draw the variants tagged `tag`: those with
-    `method` in them, or those that compare methods if it is None.
+    `method` in them, or those that compare methods of `family` if it is None.
     """
 
     text: str
@@ -23,6 +23,7 @@ class Note:
     tag: str | None
     footer: str = ""
     method: str | None = None
+    family: str | None = None
 
 
 def listed(items: Iterable[object]) -> str:
@@ -52,29 +53,72 @@ def compared(values: Mapping[str, object]) -> str:
     return "; ".join(f"{value}: {listed(names)}" for value, names in groups.items())
 
 
+def tags_shown(methods: Mapping[str, Variant]) -> str:
+    """`variants @released`, or who has the tag: `@released: BC-, SC- and SBC-DQN`."""
+    tags = {v.tag for v in methods.values()}
+    (tag,) = tags - {None} or {None}
+    if tag is None or len(tags) == 1:
+        return f"variants @{tag}" if tag else ""
+    names = [name for name, v in methods.items() if v.tag == tag]
+    shared = [name for name in names if name.endswith("-DQN")]
+    short = [n.removesuffix("DQN") if n in shared[:-1] else n for n in names]
+    return f"@{tag}: {', '.join(short)}"
+
+
+def remarks(
+    notes: Iterable[Note], methods: Mapping[str, Variant], compares: bool = True
+) -> list[str]:
+    """What belongs under a figure of `methods`, which may be of several tags.
+
+    `compares`: differences between methods belong to it too.
+    """
+    env, family = next((v.env, v.family) for v in methods.values())
+    tags = {v.tag for v in methods.values()}
+
+    def belongs(note: Note) -> bool:
+        if note.env != env:
+            return False
+        if note.method is None:
+            return compares and note.family == family and {note.tag} == tags
+        return note.method in methods and methods[note.method].tag == note.tag
+
+    shown = [note for note in notes if belongs(note)]
+    if compares and len(tags) > 1:  # no notes were made for such a mixture yet
+        shown += across_methods(methods, methods, env, None, family)
+    return [note.footer for note in shown if note.footer]
+
+
 def across_methods(
-    methods: Mapping[str, Variant], expected: Iterable[str], env: str, tag: str | None
+    methods: Mapping[str, Variant],
+    expected: Iterable[str],
+    env: str,
+    tag: str | None,
+    family: str = "FQI",
 ) -> list[Note]:
-    """Notes on compared methods that are absent or that differ in seeds or length."""
+    """Notes on compared methods that are absent or that differ in seeds or length.
+
+    In the DQN family lengths differ by design and aren't compared.
+    """
     suffix = f"@{tag}" if tag else ""
     notes = []
+
+    def add(text: str, footer: str) -> None:
+        notes.append(Note(text, env, tag, footer, family=family))
+
     absent = [name for name in expected if name not in methods]
     if absent:
         names = listed(name + suffix for name in absent)
-        notes.append(
-            Note(f"{env}: no runs of {names}", env, tag, f"no runs of {names}")
-        )
+        add(f"{env}: no runs of {names}", f"no runs of {names}")
     seeds = {v.name: ranges(v.seeds) for v in methods.values()}
     if len(set(seeds.values())) > 1:
         text = f"{env}: seeds differ between methods ({compared(seeds)})"
-        notes.append(Note(text, env, tag, footer=f"seeds differ: {compared(seeds)}"))
+        add(text, f"seeds differ: {compared(seeds)}")
     lengths = {v.name: len(v.stage) for v in methods.values()}
-    if len(set(lengths.values())) > 1:
+    if family == "FQI" and len(set(lengths.values())) > 1:
         text = f"{env}: iterations differ between methods ({compared(lengths)})"
-        short = f"iterations differ: {compared(lengths)}"
-        notes.append(Note(text, env, tag, footer=short))
+        add(text, f"iterations differ: {compared(lengths)}")
     optima = {v.name: v.optimum for v in methods.values()}
     if len({o for o in optima.values() if o is not None}) > 1:
         text = f"{env}: optima differ between methods ({compared(optima)})"
-        notes.append(Note(text, env, tag, footer="optima differ: none drawn"))
+        add(text, "optima differ: none drawn")
     return notes

@@ -13,8 +13,14 @@ from numpy.typing import NDArray
 
 from bcrl.errors import BcrlError
 
-#: The first columns of every CSV: 1-based stage and task, iteration over the whole run.
-INDEX = ("stage", "task", "iteration")
+#: The first columns of a family's CSVs: 1-based stage and task, then what counts the
+#: rows: iterations over the whole run, or environment steps of all stages so far.
+INDEX = {"FQI": ("stage", "task", "iteration"), "DQN": ("stage", "task", "step")}
+
+
+def family_of(table: pd.DataFrame) -> str:
+    """The family whose learners leave such a table, told by its counting column."""
+    return "DQN" if "step" in table and "iteration" not in table else "FQI"
 
 
 def unreadable(path: Path, what: str) -> BcrlError:
@@ -57,6 +63,11 @@ def read_csv(path: Path) -> pd.DataFrame:
         expected = np.arange(1, len(table) + 1)
         if not np.array_equal(table["iteration"], expected):
             raise unreadable(path, f"does not count iterations 1 to {len(table)}")
+    elif "step" in table:
+        steps = table["step"]
+        whole = np.isfinite(steps) & (steps >= 0) & (steps % 1 == 0)
+        if not whole.all() or (np.diff(steps) < 0).any():
+            raise unreadable(path, "has steps that are not whole numbers ≥ 0 or fall")
     for column in {"stage", "task"} & set(table):
         numbers = table[column]
         if not (np.isfinite(numbers) & (numbers >= 1) & (numbers % 1 == 0)).all():

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bcrl import __version__
 from bcrl.files import write_atomically
-from bcrl.report.load import Variant
+from bcrl.report.variants import Variant
 
 #: One colour per way of transfer, in every figure and for FQI and DQN alike: Okabe and
 #: Ito's palette and a grey. Yellow is left out, it vanishes on white.
@@ -30,6 +30,7 @@ COLOURS = {
     "SBC": "#CC79A7",
     "RPL": "#000000",
     "PPR": "#8C8C8C",
+    "LSPI": "#7A4B1E",  # pretraining only
 }
 BANDS = ("#EBEBEB", "#F8F8F8")
 OPTIMUM = {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 1.0}

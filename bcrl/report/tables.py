@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bcrl.report.load import Runs, Variant
 from bcrl.report.seedfiles import INDEX
 from bcrl.report.statistics import (
     Interval,
@@ -18,27 +17,27 @@ from bcrl.report.statistics import (
     share_interval,
     standard_error,
 )
+from bcrl.report.variants import Runs, Variant
 
-AGGREGATE_COLUMNS = (
-    "scale",
-    "env",
-    "variant",
-    *INDEX,
-    "metric",
-    "seeds",
-    "mean",
-    "standard_error",
-)
+_SUMMARY = ("metric", "seeds", "mean", "standard_error")
+AGGREGATE_COLUMNS = {
+    family: ("scale", "env", "variant", *index, *_SUMMARY)
+    for family, index in INDEX.items()
+}
 
 
-def aggregate(runs: Runs) -> pd.DataFrame:
-    """Mean and standard error over seeds of every metric at every iteration.
+def aggregate(runs: Runs, family: str = "FQI") -> pd.DataFrame:
+    """Mean and standard error over seeds of every metric at every evaluation.
 
-    One row per (variant, iteration, metric), tagged variants included; columns
-    AGGREGATE_COLUMNS. A mean over a non-finite value is empty.
+    One row per (variant, iteration or step, metric), tagged variants included; columns
+    AGGREGATE_COLUMNS[family]. A mean over a non-finite value is empty.
     """
+    columns = AGGREGATE_COLUMNS[family]
+    *_, counter = INDEX[family]
     blocks = []
     for variant in runs.variants:
+        if variant.family != family:
+            continue
         for metric, values in variant.metrics.items():
             block = {
                 "scale": runs.scale,
@@ -46,13 +45,13 @@ def aggregate(runs: Runs) -> pd.DataFrame:
                 "variant": variant.name,
                 "stage": variant.stage,
                 "task": variant.task,
-                "iteration": variant.iterations,
+                counter: variant.index,
                 "metric": metric,
                 "seeds": len(variant.seeds),
                 "mean": mean(values),
                 "standard_error": standard_error(values),
             }
-            blocks.append(pd.DataFrame(block, columns=AGGREGATE_COLUMNS))
+            blocks.append(pd.DataFrame(block, columns=columns))
     return pd.concat(blocks, ignore_index=True)
 
 
@@ -80,7 +79,8 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([line(header), rule, *map(line, rows)]) + "\n"
 
 
-def _mean_cell(values: NDArray[np.float64]) -> str:
+def mean_cell(values: NDArray[np.float64]) -> str:
+    """Mean of (S,) values over seeds with its interval."""
     return estimate(float(values.mean()), bootstrap(values))
 
 
@@ -103,7 +103,7 @@ def final_table(methods: Mapping[str, Variant]) -> str:
     rows = []
     for name, variant in methods.items():
         last = {m: variant.metrics[m][:, -1] for m in metrics}
-        row = [name, str(len(variant.seeds)), *map(_mean_cell, last.values())]
+        row = [name, str(len(variant.seeds)), *map(mean_cell, last.values())]
         row += [number(interquartile_mean(values)) for values in last.values()]
         if solved:
             row.append(_share_cell(variant.metrics["solved"][:, -1]))

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.report.load import Variant
 from bcrl.report.notes import listed
 from bcrl.report.statistics import (
     Interval,
@@ -20,6 +19,7 @@ from bcrl.report.statistics import (
     share_interval,
 )
 from bcrl.report.tables import estimate
+from bcrl.report.variants import Variant
 
 #: Below this a percentile bootstrap is far too narrow: no verdict is given.
 FEWEST_SEEDS = 5

@@ -1,0 +1,218 @@
+"""A point mass under force control: an LQ task, and a narrow pathway with drift."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bcrl.arrays import like, namespace, ndtri
+from bcrl.envs.base import Step
+from bcrl.errors import ConfigError, at_least, did_you_mean
+
+DT = 0.05  # s, Euler step
+NOISE = 1e-5  # standard deviation of the noise on each component of the derivative
+WALLS = (-5.0, 1.0)  # x of the two reflecting walls (target task)
+PATHWAY = 0.5  # |y| beyond which the target task starts anew
+GOAL_RADIUS = 0.2  # distance to the origin that counts as success
+STATE_COST = np.array([3.0, 1.0, 3.0, 1.0])  # diagonal, LQ task
+ACTION_COST = 0.1  # per squared unit of force, LQ task
+START = np.array([-4.0, 0.0, 0.0, 0.0])
+DIAGONAL = np.sqrt(0.5)
+ACTIONS = np.array(
+    [[1, 0], [-1, 0], [0, 1], [0, -1]]
+    + [[a * DIAGONAL, b * DIAGONAL] for a in (1, -1) for b in (1, -1)]
+)
+VELOCITIES, POSITIONS = (1, 3), (0, 2)
+
+
+class Constants(NamedTuple):
+    """What the readings differ in: dynamics, and the half-width of the start's box."""
+
+    gain: float
+    friction: float
+    spread: tuple[float, float, float, float]
+
+
+#: preset → task → constants (paper, C.3; released code)
+PRESETS = {
+    "released": {
+        "lq": Constants(2.0, 0.1, (0.3, 0.3, 0.3, 0.3)),
+        "target": Constants(2.0, 1.0, (1e-3, 0.1, 0.4, 0.1)),
+    },
+    "paper": {
+        "lq": Constants(1.0, 0.1, (0.0, 0.3, 0.0, 0.3)),
+        "target": Constants(1.0, 0.1, (0.0, 0.1, 0.4, 0.1)),
+    },
+}
+
+
+@dataclass(frozen=True)
+class LinearSystem:
+    """Push a point mass from x = −4 to the origin.
+
+    | | |
+    |---|---|
+    | observation | (x, ẋ, y, ẏ), dimensionless |
+    | actions | unit forces: 0–3 +x, −x, +y, −y; 4–7 (+,+), (+,−), (−,+), (−,−) |
+    | dynamics | x' = ẋ, ẋ' = −friction ẋ + gain F_x, same for y; noise N(0, 1e-5²) on each derivative; Euler steps of 0.05 s |
+    | `task=lq` | reward −s'ᵀ diag(3, 1, 3, 1) s' − 0.1 ‖F‖²; horizon 100; never absorbing |
+    | `task=target` | `drift` is added to x'; walls at x = −5 and x = 1 reflect; whoever ends a step with \\|y\\| > 0.5 is put back to a fresh start (not absorbing); reward 0 and absorbing if ‖(x, y)‖ < 0.2, else −1; horizon 150 |
+    | start | (−4, 0, 0, 0) plus a uniform draw from a box, see PRESETS |
+    | source | Klink et al. (2022), §6.3 and C.3; released code for dt, walls, γ, horizons |
+
+    `preset=released` (default) has gain 2, friction 0.1 in the LQ task and 1.0 in the
+    target, `paper` gain 1 and friction 0.1 in both, and smaller start boxes. Runs on
+    NumPy arrays and on torch tensors alike. Raises ConfigError for an unknown task or
+    preset, γ outside [0, 1) or a horizon below 1.
+    """  # noqa: E501
+
+    task: str = "target"
+    drift: float = -0.5
+    gamma: float = 0.99
+    horizon: int = 150
+    preset: str = "released"
+
+    name: ClassVar[str] = "linear_system"
+    n_actions: ClassVar[int] = 8
+    state_dim: ClassVar[int] = 4
+    initial_noise: ClassVar[int] = 4
+    step_noise: ClassVar[int] = 8  # four for the derivative, four for a fresh start
+    actions: ClassVar[NDArray[np.float64]] = ACTIONS
+
+    def __post_init__(self) -> None:
+        for key, allowed in (("task", ("lq", "target")), ("preset", tuple(PRESETS))):
+            value = getattr(self, key)
+            if value not in allowed:
+                raise ConfigError(f"env.{key}", value, did_you_mean(value, allowed))
+        if not 0.0 <= self.gamma < 1.0:
+            raise ConfigError("env.gamma", self.gamma, "must lie in [0, 1)")
+        at_least("env.horizon", self.horizon, 1)
+
+    @property
+    def constants(self) -> Constants:
+        """Gain, friction and start box of this task in this preset."""
+        return PRESETS[self.preset][self.task]
+
+    @property
+    def linear_quadratic(self) -> tuple[NDArray[np.float64], ...] | None:
+        """A, B, Q, R of s' = A s + B F, reward −s'ᵀ Q s' − Fᵀ R F; None if not so."""
+        if self.task != "lq":
+            return None
+        gain, friction, _ = self.constants
+        drift = np.kron(np.eye(2), np.array([[0.0, 1.0], [0.0, -friction]]))
+        push = np.kron(np.eye(2), np.array([[0.0], [gain]]))
+        return (
+            np.eye(4) + DT * drift,
+            DT * push,
+            np.diag(STATE_COST),
+            ACTION_COST * np.eye(2),
+        )
+
+    def initial(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Start states (..., 4): the box around (−4, 0, 0, 0), for noise (..., 4)."""
+        spread = like(np.array(self.constants.spread), noise)
+        return like(START, noise) + spread * (2.0 * noise - 1.0)
+
+    def step(
+        self,
+        state: NDArray[np.float64],
+        action: NDArray[np.integer],
+        noise: NDArray[np.float64],
+    ) -> Step:
+        """One step with action (...), an index into `actions`."""
+        return self.push(state, like(ACTIONS, state)[action], noise)
+
+    def push(
+        self,
+        state: NDArray[np.float64],
+        force: NDArray[np.float64],
+        noise: NDArray[np.float64],
+    ) -> Step:
+        """One step with any force (..., 2); the fresh start, if any, is in `noise`."""
+        xp = namespace(state)
+        moved = self._move(state, force, noise)
+        if self.task == "lq":
+            cost = (like(STATE_COST, moved) * moved**2).sum(-1)
+            cost = cost + ACTION_COST * (force**2).sum(-1)
+            return moved, -cost, xp.zeros_like(cost, dtype=bool)
+        fell = abs(moved[..., 2]) > PATHWAY
+        after = xp.where(fell[..., None], self.initial(noise[..., 4:]), moved)
+        arrived = after[..., 0] ** 2 + after[..., 2] ** 2 < GOAL_RADIUS**2
+        return after, xp.where(arrived, 0.0, -1.0), arrived
+
+    def before_reset(
+        self,
+        state: NDArray[np.float64],
+        action: NDArray[np.integer],
+        noise: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Where `step` leads before a fresh start replaces it, (..., 4)."""
+        return self._move(state, like(ACTIONS, state)[action], noise)
+
+    def _move(
+        self,
+        state: NDArray[np.float64],
+        force: NDArray[np.float64],
+        noise: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Integrate and, in the target task, reflect."""
+        gain, _, _ = self.constants
+        xp = namespace(state)
+        free = self._derivative(state)
+        pushed = xp.zeros_like(state)
+        pushed[..., VELOCITIES[0]] = gain * force[..., 0]
+        pushed[..., VELOCITIES[1]] = gain * force[..., 1]
+        if self.task == "target":
+            pushed[..., 0] = self.drift
+        moved = state + DT * (free + pushed + NOISE * ndtri(noise[..., :4]))
+        if self.task == "lq":
+            return moved
+        low, high = WALLS
+        x = moved[..., 0]
+        beyond = (x < low) | (x > high)
+        if not beyond.any():
+            return moved
+        # Up to the contact in a straight line, then on without force and drift.
+        wall = xp.where(x < low, low, high)
+        step = xp.where(beyond, x - state[..., 0], 1.0)
+        share = xp.where(beyond, (wall - state[..., 0]) / step, 1.0)[..., None]
+        contact = state + share * (moved - state)
+        contact[..., 1] = -contact[..., 1]
+        onward = contact + (1.0 - share) * DT * self._derivative(contact)
+        return xp.where(beyond[..., None], onward, moved)
+
+    def _derivative(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The derivative without force, drift and noise, (..., 4)."""
+        xp, friction = namespace(state), self.constants.friction
+        x_dot, y_dot = state[..., 1], state[..., 3]
+        return xp.stack([x_dot, -friction * x_dot, y_dot, -friction * y_dot], -1)
+
+    def evaluation_states(self) -> NDArray[np.float64]:
+        """The start box's centre and the corners of the box half as wide, (17, 4)."""
+        corners = np.stack(np.meshgrid(*[[0.25, 0.75]] * 4, indexing="ij"), -1)
+        return self.initial(np.vstack([np.full((1, 4), 0.5), corners.reshape(-1, 4)]))
+
+    def plane(self, side: int = 41, extent: float = 5.0) -> NDArray[np.float64]:
+        """The x–y plane [−extent, extent]² at zero velocity, x-major, (side², 4)."""
+        axis = np.linspace(-extent, extent, side)
+        states = np.zeros((side, side, 4))
+        states[..., 0], states[..., 2] = np.meshgrid(axis, axis, indexing="ij")
+        return states.reshape(-1, 4)
+
+    def scene(self) -> dict[str, NDArray[np.float64]]:
+        """What a figure needs to draw the task: forces, pathway, goal, start, drift."""
+        half = np.array(self.constants.spread)[[0, 2]]
+        at = START[[0, 2]]
+        return {
+            "actions": ACTIONS,
+            "pathway": np.array([WALLS[0], -PATHWAY, WALLS[1], PATHWAY]),
+            "goal": np.array([0.0, 0.0, GOAL_RADIUS]),
+            "start": np.concatenate([at - half, at + half]),
+            "drift": np.array([self.drift, 0.0]),
+        }
+
+
+ENV = LinearSystem

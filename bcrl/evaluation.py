@@ -1,0 +1,83 @@
+"""Evaluation of learners that count steps: complete episodes of streams of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bcrl.envs import Env
+from bcrl.probes import probed_states, scene
+from bcrl.rollout import CHOICES, play, start_states
+from bcrl.stage import Moment
+from bcrl.streams import stream
+
+
+def evaluate(now: Moment, seeds: Sequence[int]) -> list[dict[str, float]]:
+    """Each seed's columns of docs/metrics.md, in the unwrapped task of the stage.
+
+    The exploring policy and the greedy one meet the same starts and the same noise,
+    which depend on seed, stage and step alone: evaluating changes no training.
+    """
+    env, n = now.stage.env, now.episodes
+    rngs = [
+        stream(seed, "evaluation", now.stage.number, now.count - now.stage.before)
+        for seed in seeds
+    ]
+    start = np.stack([start_states(rng, env, n) for rng in rngs])
+    shape = (env.horizon, n, CHOICES + env.step_noise)
+    u = np.stack([rng.random(shape) for rng in rngs])
+    played = play(env, now.policy, np.tile(start, (1, 2, 1)), np.tile(u, (1, 1, 2, 1)))
+    outcomes = {
+        "return": played.reward.sum(-1),
+        "discounted_return": played.discounted_return(env.gamma),
+        "success_rate": played.solved(),
+    }
+    best = np.asarray(now.learned.q(start, env.n_actions)).max(-1)
+    return [
+        {name: float(values[s, :n].mean()) for name, values in outcomes.items()}
+        | {"q_mean": float(best[s].mean()), "loss": float(now.loss[s])}
+        | {f"greedy_{k}": float(values[s, n:].mean()) for k, values in outcomes.items()}
+        for s in range(len(seeds))
+    ]
+
+
+@dataclass
+class StepProbe:
+    """Measures moments of several seeds; keeps each stage's Q at its end."""
+
+    seeds: Sequence[int]
+    tasks: Sequence[Env]
+    _q: list[NDArray[np.float32]] = field(default_factory=list)
+    _learners: list[str] = field(default_factory=list)
+
+    index: ClassVar[str] = "step"  # what a moment's count is
+
+    @cached_property
+    def states(self) -> NDArray[np.float64]:
+        """The states (n, d) at which Q is kept, for figures."""
+        target = self.tasks[-1]
+        return target.plane() if hasattr(target, "plane") else probed_states(target)
+
+    def measure(self, now: Moment) -> list[dict[str, float]]:
+        """Each seed's row of the CSV."""
+        if now.last_of_stage:
+            env, n = now.stage.env, len(self.seeds)
+            asked = np.broadcast_to(self.states, (n, *self.states.shape))
+            self._q.append(np.asarray(now.learned.q(asked, env.n_actions), np.float32))
+            self._learners.append(now.stage.learner.name)
+        return evaluate(now, self.seeds)
+
+    def arrays(self, s: int) -> dict[str, NDArray]:
+        """What seed number s ends with: the stages' Q at `states`."""
+        kept = np.stack([q[s] for q in self._q])
+        found = {"states": self.states, "q": kept[-1], "q_stages": kept}
+        return found | scene(self.tasks)
+
+    def facts(self) -> dict[str, Any]:
+        """What else is known of the run: the learner of each stage."""
+        return {"learners": self._learners}

@@ -1,0 +1,148 @@
+"""Least-squares policy iteration with quadratic features (Lagoudakis and Parr 2003)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bcrl.arrays import ndtri
+from bcrl.q import ZERO, Q
+from bcrl.q.quadratic import Quadratic, features
+from bcrl.rollout import Policy, play, start_states
+from bcrl.stage import Moment, Stage, Team
+from bcrl.streams import stream
+from bcrl.transfer import Learned, Start
+
+
+@dataclass(frozen=True)
+class LSPI:
+    """Policy iteration on a = K s + noise, K = 0 at first (paper, C.3).
+
+    Each iteration collects `episodes` with the current gain, solves LSTDQ on them alone
+    and sets K ← −Quu⁻¹ Qus. `features`: see `bcrl.q.quadratic`. `drop_last` leaves each
+    episode's last step out [released]. A gain that is not finite, or pushes away from
+    the goal (K[0, 0] or K[1, 2] above 0), ends its seed.
+    """
+
+    iterations: int = 4
+    episodes: int = 5
+    noise_std: float = 0.1
+    features: str = "products"
+    drop_last: bool = True
+    evaluation_episodes: int = 50
+    horizon: int = 100  # the env's
+
+    name: ClassVar[str] = "lspi"
+
+    @property
+    def length(self) -> int:
+        """Environment steps of a stage."""
+        return self.iterations * self.episodes * self.horizon
+
+    def learn(self, stage: Stage, start: Start, team: Team) -> Iterator[Moment]:
+        """Learn an LQ task; yields before the first and after each iteration."""
+        env, n = stage.env, len(team.seeds)
+        k = env.actions.shape[1]
+        gain, q = np.zeros((n, k, env.state_dim)), ZERO
+        failed: dict[int, str] = {}
+        for iteration in range(self.iterations + 1):
+            if iteration:
+                z, after, reward = self._collect(stage, gain, iteration, team)
+                theta = [
+                    lstdq(*(part[s] for part in (z, after, reward)), env.gamma, self)
+                    for s in range(n)
+                ]
+                m = env.state_dim + k
+                q = Quadratic.from_weights(
+                    np.stack(theta), self.features, m, env.actions
+                )
+                for s in range(n):
+                    found = improved(q.matrix[s], env.state_dim)
+                    if found is None:
+                        why = f"LSPI found no stabilising gain in iteration {iteration}"
+                        failed.setdefault(s, why)
+                    gain[s] = 0.0 if found is None else found
+            yield self._moment(stage, iteration, q, gain.copy(), failed)
+
+    def _moment(
+        self, stage: Stage, iteration: int, q: Q, gain: NDArray, failed: dict[int, str]
+    ) -> Moment:
+        policy = _linear(gain)  # evaluated without noise, so greedy is the same
+        return Moment(
+            stage,
+            stage.before + iteration * self.length // self.iterations,
+            iteration == self.iterations,
+            Learned(q, q),
+            policy,
+            self.evaluation_episodes,
+            np.full(len(gain), np.nan),
+            dict(failed),
+        )
+
+    def _collect(
+        self, stage: Stage, gain: NDArray, iteration: int, team: Team
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Each seed's (s, a) (S, n, m), next (s', K s') and rewards (S, n)."""
+        env, k = stage.env, gain.shape[1]
+        rngs = [stream(x, "data", stage.number, iteration) for x in team.seeds]
+        begin = np.stack([start_states(rng, env, self.episodes) for rng in rngs])
+        shape = (env.horizon, self.episodes, k + env.step_noise)
+        u = np.stack([rng.random(shape) for rng in rngs])
+        played = play(env, _linear(gain, self.noise_std), begin, u)
+        cut = env.horizon - 1 if self.drop_last else env.horizon
+        before, after = played.state[:, :, :cut], played.state[:, :, 1 : cut + 1]
+        z = np.concatenate([before, played.action[:, :, :cut]], -1)
+        on_policy = np.concatenate([after, _apply(gain, after)], -1)
+        n, m = len(gain), z.shape[-1]
+        reward = played.reward[:, :, :cut].reshape(n, -1)
+        return z.reshape(n, -1, m), on_policy.reshape(n, -1, m), reward
+
+
+def lstdq(
+    z: NDArray, after: NDArray, reward: NDArray, gamma: float, settings: LSPI
+) -> NDArray[np.float64]:
+    """Weights θ with Φᵀ(Φ − γΦ') θ = Φᵀ r; the pseudo-inverse's if that is singular.
+
+    z and after (n, m) are state-actions and the policy's at the next states.
+    """
+    phi = features(z, settings.features)
+    a = phi.T @ (phi - gamma * features(after, settings.features))
+    b = phi.T @ reward
+    if np.linalg.matrix_rank(a) == len(a):
+        return np.linalg.solve(a, b)
+    return np.linalg.pinv(a) @ b
+
+
+def _apply(gain: NDArray, state: NDArray) -> NDArray[np.float64]:
+    """K s of states (S, …, d) for gains (S, k, d), shape (S, …, k)."""
+    lanes = gain.reshape(len(gain), *[1] * (state.ndim - 2), *gain.shape[1:])
+    return (lanes * state[..., None, :]).sum(-1)
+
+
+def _linear(gain: NDArray, noise_std: float = 0.0) -> Policy:
+    """The policy a = K s + N(0, noise_std²), its first uniforms being the noise's."""
+
+    def act(now: NDArray, u: NDArray, alive: NDArray) -> NDArray:
+        force = _apply(gain, now)
+        return (
+            force + noise_std * ndtri(u[..., : gain.shape[1]]) if noise_std else force
+        )
+
+    return act
+
+
+def improved(matrix: NDArray[np.float64], d: int) -> NDArray[np.float64] | None:
+    """K (k, d) = −Quu⁻¹ Qus of Q = zᵀ `matrix` z; None if no K pulls to the goal.
+
+    With states (x, ẋ, y, ẏ, …) force i must not grow with position i.
+    """
+    try:
+        gain = -np.linalg.solve(matrix[d:, d:], matrix[d:, :d])
+    except np.linalg.LinAlgError:
+        return None
+    own = [gain[i, 2 * i] for i in range(len(gain))]
+    return gain if np.isfinite(gain).all() and max(own) <= 0.0 else None

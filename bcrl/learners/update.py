@@ -1,0 +1,63 @@
+"""DQN's gradient step on S seeds: batched on any device, compiled on a CPU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from bcrl.q import fused
+from bcrl.q.mlp import DeepQ, Networks
+from bcrl.replay import Replay
+
+Update = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+
+
+def updater(deep: DeepQ, replay: Replay) -> Update:
+    """The function that makes one step from the batches at `places` (S, B).
+
+    It returns each seed's mean smooth-L1 loss (S,). Both ways compute the same
+    (tests/test_dqn.py), and no seed's result depends on the others.
+    """
+    if deep.online.flat.device.type == "cpu":
+        return compiled(deep, replay)
+    return batched(deep, replay)
+
+
+def batched(deep: DeepQ, replay: Replay) -> Update:
+    """Stacked matrix products in torch."""
+    online, target = deep.online, deep.target
+    gradient = Networks(online.sizes, torch.zeros_like(online.flat))
+
+    def update(places: NDArray[np.int64]) -> NDArray[np.float64]:
+        batch = replay.sample(torch.from_numpy(places).to(online.flat.device))
+        next_values = target.forward(batch.next_state).add_(batch.next_base)
+        y = torch.addcmul(batch.fixed, batch.discount, next_values.amax(-1))
+        output = online.forward(batch.state)
+        error = output.gather(-1, batch.action)[..., 0] - y
+        # The loss is the mean over the batch and the sum over seeds.
+        clipped = error.clamp(-1.0, 1.0)
+        slope = torch.zeros_like(output)
+        slope.scatter_(-1, batch.action, (clipped / error.shape[1])[..., None])
+        online.backward(batch.state, slope, gradient)
+        deep.optimiser.step(online.flat, gradient.flat)
+        return (clipped * (error - 0.5 * clipped)).mean(1).cpu().numpy()
+
+    return update
+
+
+def compiled(deep: DeepQ, replay: Replay) -> Update:
+    """One seed after the other in compiled code."""
+    buffers = (deep.online.flat, deep.target.flat, deep.optimiser.moments)
+    online, target, moments = (buffer.numpy() for buffer in buffers)
+    sizes, layout = np.array(deep.online.sizes), (replay.d, replay.n_actions)
+    rows = replay.rows.numpy()
+
+    def update(places: NDArray[np.int64]) -> NDArray[np.float64]:
+        adam, loss = deep.optimiser.next_step(), np.zeros(len(online))
+        fused.update(online, target, moments, sizes, rows, places, layout, adam, loss)
+        return loss
+
+    return update

@@ -1,0 +1,61 @@
+"""Q-functions quadratic in state and action: what LSPI learns in an LQ task."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bcrl.q import Values, each
+
+#: products: all z_i z_j, i ≤ j [released]; linear_quadratic: the z_i besides [paper].
+FEATURES = ("products", "linear_quadratic")
+
+
+def features(z: NDArray[np.float64], kind: str) -> NDArray[np.float64]:
+    """φ(z) of state-action vectors z (..., m): m(m+1)/2 products, or m more."""
+    i, j = np.triu_indices(z.shape[-1])
+    products = z[..., i] * z[..., j]
+    return products if kind == "products" else np.concatenate([z, products], -1)
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """Q(s, a) = zᵀ M z + lᵀ z with z = (s, a), for S seeds and a table of actions."""
+
+    matrix: NDArray[np.float64]  # (S, m, m), symmetric
+    linear: NDArray[np.float64]  # (S, m)
+    actions: NDArray[np.float64]  # (A, k)
+
+    @classmethod
+    def from_weights(
+        cls, theta: NDArray[np.float64], kind: str, m: int, actions: NDArray[np.float64]
+    ) -> Quadratic:
+        """From the weights θ (S, F) of `features(z, kind)` for z of length m."""
+        linear, products = np.zeros((len(theta), m)), theta
+        if kind == "linear_quadratic":
+            linear, products = theta[:, :m], theta[:, m:]
+        matrix = np.zeros((len(theta), m, m))
+        i, j = np.triu_indices(m)
+        matrix[:, i, j] = products / 2.0
+        return cls(matrix + matrix.transpose(0, 2, 1), linear, actions)
+
+    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        if isinstance(states, np.ndarray):
+            return self._values(states, self.matrix, self.linear)
+        return each(
+            states,
+            lambda s: self._values(states[s], self.matrix[s], self.linear[s]),
+        )
+
+    def _values(self, x: NDArray, matrix: NDArray, linear: NDArray) -> NDArray:
+        """Values (..., n, A) at states x (..., n, d) of matrices (..., m, m)."""
+        d, act = x.shape[-1], self.actions
+        of_state, cross = matrix[..., :d, :d], matrix[..., :d, d:]
+        square = (x * (x @ of_state + linear[..., None, :d])).sum(-1, keepdims=True)
+        mixed = 2.0 * (x @ (cross @ act.T))
+        alone = (act @ matrix[..., d:, d:] * act).sum(-1)
+        alone = alone + (act * linear[..., None, d:]).sum(-1)
+        return square + mixed + alone[..., None, :]

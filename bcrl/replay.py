@@ -1,0 +1,91 @@
+"""A replay buffer for S seeds: packed transitions, the oldest overwritten first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Batch:
+    """B transitions of each of S seeds, float32 but for the action.
+
+    The regression target of ϱ(s, a) is `fixed + discount · max_a' (ϱ + base)(s', a')`.
+    """
+
+    state: torch.Tensor  # (S, B, d)
+    next_state: torch.Tensor  # (S, B, d)
+    next_base: torch.Tensor  # (S, B, A)
+    fixed: torch.Tensor  # (S, B)
+    discount: torch.Tensor  # (S, B)
+    action: torch.Tensor  # (S, B, 1), int64
+
+
+class Replay:
+    """The last `capacity` transitions of each seed, and their targets' frozen parts.
+
+    What base and shaping add to a target is fixed when a transition is stored, so it is
+    computed once and not for every batch that draws it.
+    """
+
+    def __init__(
+        self, n_seeds: int, capacity: int, d: int, n_actions: int, device: str
+    ) -> None:
+        self.d, self.n_actions, self.capacity = d, n_actions, capacity
+        width = 2 * d + n_actions + 3
+        self.rows = torch.zeros((n_seeds, capacity, width), device=device)
+        self.added = 0
+        self._row = np.empty((n_seeds, width), np.float32)
+        self._first = torch.arange(n_seeds, device=device)[:, None] * capacity
+
+    @property
+    def size(self) -> int:
+        """Transitions held of each seed."""
+        return min(self.added, self.capacity)
+
+    def add(
+        self,
+        state: NDArray[np.float64],
+        next_state: NDArray[np.float64],
+        next_base: NDArray[np.float64],
+        fixed: NDArray[np.float64],
+        discount: NDArray[np.float64],
+        action: NDArray[np.intp],
+    ) -> None:
+        """Store one transition of every seed; shapes as in `Batch` without B."""
+        d, end, row = self.d, 2 * self.d + self.n_actions, self._row
+        row[:, :d], row[:, d : 2 * d], row[:, 2 * d : end] = (
+            state,
+            next_state,
+            next_base,
+        )
+        row[:, end], row[:, end + 1], row[:, end + 2] = fixed, discount, action
+        self.rows[:, self.added % self.capacity] = torch.from_numpy(row)
+        self.added += 1
+
+    def places(self, u: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Which of a seed's rows uniforms u (T, S, B) pick in the next T steps.
+
+        Step t comes after adding t + 1 more; with replacement.
+        """
+        held = np.arange(1, len(u) + 1) + self.added
+        return (u * np.minimum(held, self.capacity)[:, None, None]).astype(np.int64)
+
+    def sample(self, places: torch.Tensor) -> Batch:
+        """The transitions at `places` (S, B)."""
+        n_seeds, _, width = self.rows.shape
+        flat = (places + self._first).flatten()
+        rows = self.rows.view(-1, width).index_select(0, flat)
+        rows = rows.view(n_seeds, -1, width)
+        d, end = self.d, 2 * self.d + self.n_actions
+        return Batch(
+            rows[..., :d],
+            rows[..., d : 2 * d],
+            rows[..., 2 * d : end],
+            rows[..., end],
+            rows[..., end + 1],
+            rows[..., end + 2 :].long(),
+        )
