@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup figures paper smoke test lint bench clean
+.PHONY: help setup figures paper searches smoke test lint bench clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -20,19 +20,28 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	@touch $@
 
-figures: $(READY) ## Figures 1, 2, 3 and 5 from runs of your own: 3 seeds a variant, minutes
+figures: $(READY) ## the paper's figures from runs of your own: 3 seeds a variant, minutes
 	$(BIN)/bcrl experiment=fig1 scale=quick
 	$(BIN)/bcrl experiment=fig2 scale=quick
+	$(BIN)/bcrl experiment=fig4 scale=quick workers=$(WORKERS)
 	$(BIN)/bcrl-report --scale quick
 
 paper: $(READY) ## the same at the paper's number of seeds
 	$(BIN)/bcrl experiment=fig1 scale=paper workers=$(WORKERS)
 	$(BIN)/bcrl experiment=fig2 scale=paper workers=$(WORKERS)
+	$(BIN)/bcrl experiment=fig4 scale=paper workers=$(WORKERS)
 	$(BIN)/bcrl-report --scale paper
+
+searches: $(READY) ## the searches of appendix C.3 on seeds of their own, with summary tables
+	$(BIN)/bcrl experiment=search_target_update workers=$(WORKERS)
+	$(BIN)/bcrl experiment=search_offset workers=$(WORKERS)
+	$(BIN)/bcrl experiment=search_nu workers=$(WORKERS)
+	$(BIN)/bcrl-report --scale search
 
 smoke: $(READY) ## every variant in seconds, then the report
 	$(BIN)/bcrl experiment=fig1 scale=smoke
 	$(BIN)/bcrl experiment=fig2 scale=smoke
+	$(BIN)/bcrl experiment=fig4 scale=smoke
 	$(BIN)/bcrl-report --scale smoke
 
 test: $(READY) ## the tests
@@ -42,9 +51,10 @@ lint: $(READY) ## style and unused code
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-bench: $(READY) ## speed, as ratios against scikit-learn in one run
+bench: $(READY) ## speed, as ratios against the plain way in one run
 	$(BIN)/python bench/forest.py
 	$(BIN)/python bench/iteration.py
+	$(BIN)/python bench/dqn.py
 
 clean: ## remove .venv and caches; results in runs/ stay
 	rm -rf $(VENV) .pytest_cache .ruff_cache

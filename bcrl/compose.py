@@ -9,6 +9,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from bcrl import probes
 from bcrl.algorithms import Composition, Plain, algorithm

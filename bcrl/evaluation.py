@@ -1,4 +1,4 @@
-"""Evaluation of learners that count steps: complete episodes of streams of their own."""
+"""Evaluation of learners that count steps: complete episodes, streams of their own."""
 
 from __future__ import annotations
 

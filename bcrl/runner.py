@@ -19,8 +19,7 @@ from bcrl.compose import Plan
 from bcrl.evaluation import StepProbe
 from bcrl.probes import Probe
 from bcrl.progress import Progress, Tick
-from bcrl.stage import Team
-from bcrl.transfer import begin
+from bcrl.stage import Team, learn
 
 Seeds = tuple[int, ...]
 
@@ -124,18 +123,15 @@ def train_group(
     team = Team(seeds, probe.states, threads, plan.device)
     rows: list[list[dict]] = [[] for _ in seeds]
     failed: dict[int, str] = {}
-    learned = None
-    for stage in plan.stages:
-        start = begin(stage.transfers, learned)
-        for now in stage.learner.learn(stage, start, team):
-            where = {"stage": stage.number, "task": stage.task, probe.index: now.count}
-            for s, metrics in enumerate(probe.measure(now)):
-                if s not in failed:  # its last row is the one that shows the failure
-                    rows[s].append(where | metrics)
-            for s, why in getattr(now, "failed", {}).items():
-                failed.setdefault(s, f"{why} at {probe.index} {now.count}")
-            tick(Tick(seeds, stage.task, now.count, now.last_of_stage))
-        learned = now.learned
+    for now in learn(plan.stages, team):
+        task = now.stage.task
+        where = {"stage": now.stage.number, "task": task, probe.index: now.count}
+        for s, metrics in enumerate(probe.measure(now)):
+            if s not in failed:  # its last row is the one that shows the failure
+                rows[s].append(where | metrics)
+        for s, why in now.failed.items():
+            failed.setdefault(s, f"{why} at {probe.index} {now.count}")
+        tick(Tick(seeds, task, now.count, now.last_of_stage))
     facts = probe.facts() | {
         "wall_seconds": time.perf_counter() - wall,
         "cpu_seconds": (time.process_time() - cpu) / len(seeds),  # this seed's share

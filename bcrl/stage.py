@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bcrl.envs import Env
 from bcrl.rollout import Policy
-from bcrl.transfer import Learned, Start, Transfer
+from bcrl.transfer import Learned, Start, Transfer, begin
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,11 @@ class Snapshot:
     last_of_stage: bool
     learned: Learned
 
+    @property
+    def failed(self) -> dict[int, str]:
+        """Which of the S seeds can't go on, and why."""
+        return {}
+
 
 @dataclass(frozen=True)
 class Moment(Snapshot):
@@ -43,7 +48,11 @@ class Moment(Snapshot):
     )
     episodes: int
     loss: NDArray[np.float64]  # (S,) mean since the last moment; nan without updates
-    failed: dict[int, str] = field(default_factory=dict)  # which of S can't go on, why
+    failures: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def failed(self) -> dict[int, str]:
+        return self.failures
 
 
 class Learner(Protocol):
@@ -69,3 +78,13 @@ class Stage:
     learner: Learner
     transfers: tuple[Transfer, ...]  # from the stage before
     before: int  # iterations or environment steps of the stages before
+
+
+def learn(stages: Sequence[Stage], team: Team) -> Iterator[Snapshot]:
+    """Learn the stages in order, each started by its transfers from the one before."""
+    learned = None
+    for stage in stages:
+        start = begin(stage.transfers, learned)
+        for now in stage.learner.learn(stage, start, team):
+            yield now
+        learned = now.learned

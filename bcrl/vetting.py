@@ -76,7 +76,10 @@ def _refuse_nonsense(
 ) -> None:
     """Raise BcrlError for what Hydra would take without a word, or trip over."""
     for override in overrides:
-        key, value = override.key_or_group, override.value()
+        key = override.key_or_group
+        if override.is_delete() and key in VARIANT_GROUPS:
+            raise BcrlError(f"{key}: every run needs a choice of it")
+        value = override.value()
         if key == "experiment" and (
             isinstance(value, list) or override.is_sweep_override()
         ):

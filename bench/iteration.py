@@ -19,17 +19,17 @@ from bcrl import bellman
 from bcrl.envs import Env
 from bcrl.envs.car_on_hill import CarOnHill
 from bcrl.envs.maze import Maze
-from bcrl.learners.fqi import FQI, Stage
+from bcrl.learners.fqi import FQI, Iteration
 from bcrl.probes import probed_states
 from bcrl.q.regressors import ForestRegressor
-from bcrl.transfer import warm_start
+from bcrl.stage import Stage, Team, learn
 
 
 class Plain:
     """The plain way: arrays of all transitions, one scikit-learn forest an action."""
 
-    def __init__(self, env: Env, learner: FQI) -> None:
-        (d,) = learner._datasets
+    def __init__(self, env: Env, seen: Iteration) -> None:
+        (d,) = seen.learned.data
         again = np.repeat(np.arange(len(d.state)), d.multiplicity)
         self.env, self.action = env, d.action[again]
         self.reward, self.absorbing = d.reward[again], d.absorbing[again]
@@ -50,11 +50,10 @@ class Plain:
 
 def compare(name: str, env: Env, episodes: int, repeats: int) -> None:
     """Print one row: transitions, ms of both, ratio, after a few iterations each."""
-    learner = FQI((0,), ForestRegressor(), warm_start)
-    stage = Stage(1, 1, env, 10**9, episodes, 1.0, True)
-    ours = learner.run([stage], probed_states(env))
-    next(ours)  # collects the data and compiles
-    plain = Plain(env, learner)
+    learner = FQI(10**9, episodes, ForestRegressor())
+    stage = Stage(1, 1, env, learner, (), 0)
+    ours = learn([stage], Team((0,), probed_states(env)))
+    plain = Plain(env, next(ours))  # the first collects the data and compiles
     plain.iterate()
     steps: list[Callable[[], object]] = [plain.iterate, lambda: next(ours)]
     best = [np.inf, np.inf]

@@ -8,7 +8,9 @@ import pytest
 from bcrl import vetting
 from bcrl.curriculum import CURRICULA
 from bcrl.errors import BcrlError
-from bcrl.transfer import boost, warm_start
+from bcrl.learners.dqn import DQN
+from bcrl.learners.lspi import LSPI
+from bcrl.transfer import Boost, PolicyReuse, ResidualPolicy, Shape, warm_start
 from tests.conftest import plan, plans
 
 GROUPS = {
@@ -17,6 +19,7 @@ GROUPS = {
         *vetting.VARIANT_GROUPS,
         "algorithm/regressor",
         "budget",
+        "variant",
         "experiment",
     )
 }
@@ -27,14 +30,14 @@ GROUPS = {
     [
         ("off", "off", "FQI", warm_start),
         ("on", "off", "C-FQI", warm_start),
-        ("off", "on", "B-FQI", boost),
-        ("on", "on", "BC-FQI", boost),
+        ("off", "on", "B-FQI", Boost()),
+        ("on", "on", "BC-FQI", Boost()),
     ],
 )
 @pytest.mark.parametrize("env", GROUPS["env"])
 def test_variants_are_named_by_what_they_are(env, curriculum, boosting, name, transfer):
     p = plan(f"env={env}", f"curriculum={curriculum}", f"boosting={boosting}")
-    assert (p.name, p.transfer) == (name, transfer)
+    assert p.name == name and {s.transfers for s in p.stages} == {(transfer,)}
     assert p.directory == Path("runs/quick") / env / name
     tasks = [stage.task for stage in p.stages]
     n = len(p.tasks)
@@ -43,19 +46,19 @@ def test_variants_are_named_by_what_they_are(env, curriculum, boosting, name, tr
 
 def test_the_papers_budgets():
     maze = plan("env=maze", "curriculum=on")
-    assert [s.iterations for s in maze.stages] == [10] * 4 + [20] * 2 + [50] * 4
-    assert [s.epsilon for s in maze.stages] == [1] * 4 + [0.75] * 2 + [0.5] * 2 + [
-        0.25
-    ] * 2
-    assert {s.episodes for s in maze.stages} == {500}
-    assert all(s.new_data for s in maze.stages)
+    assert [s.learner.iterations for s in maze.stages] == [10] * 4 + [20] * 2 + [50] * 4
+    assert [s.learner.epsilon for s in maze.stages] == [1] * 4 + [0.75] * 2 + [
+        0.5
+    ] * 2 + [0.25] * 2
+    assert {s.learner.episodes for s in maze.stages} == {500}
+    assert all(s.learner.new_data for s in maze.stages)
     assert [s.env.height for s in maze.stages][::9] == [0.05, 0.95]
     hill = plan("env=car_on_hill")
-    assert [s.iterations for s in hill.stages] == [20] * 3
-    assert [s.new_data for s in hill.stages] == [True, False, False]
+    assert [s.learner.iterations for s in hill.stages] == [20] * 3
+    assert [s.learner.new_data for s in hill.stages] == [True, False, False]
     assert [s.env.mass for s in hill.stages] == [1.2] * 3
     assert all(
-        s.new_data
+        s.learner.new_data
         for s in plan("env=car_on_hill", "curriculum=on", "boosting=on").stages
     )
 
@@ -66,7 +69,9 @@ def test_scales_choose_seeds_and_cap_budgets():
     assert len(plan("env=car_on_hill", "scale=paper").seeds) == 20
     assert plan("env=maze", "seeds.first=5", "seeds.count=2").seeds == (5, 6)
     smoke = plan("env=maze", "scale=smoke")
-    assert {(s.iterations, s.episodes) for s in smoke.stages} == {(2, 20)}
+    assert {(s.learner.iterations, s.learner.episodes) for s in smoke.stages} == {
+        (2, 20)
+    }
 
 
 def test_outputs_seeds_and_workers_do_not_count_towards_the_identity():
@@ -111,7 +116,9 @@ def test_an_experiment_is_its_figures_sweep():
     }
     released = plans("experiment=fig1_released")
     assert all(
-        p.tag == "released" and p.shared_data and p.fixed_trees for p in released
+        p.tag == "released" and s.learner.shared_data and s.learner.fixed_trees
+        for p in released
+        for s in p.stages
     )
     sweep = plans("env=maze", "curriculum=on,off", "boosting=on,off", multirun=True)
     assert {p.name for p in sweep} == names
@@ -126,34 +133,114 @@ def outcome(overrides) -> str:
         return "refused"
 
 
-ENV_LESS = [g for g in GROUPS if g not in ("experiment", "env", "budget")]
+def sensible(env: str, algorithm: str, curriculum: str, boosting: str, transfer: str):
+    """Whether docs/architecture.md says that this combination runs."""
+    steered = transfer in ("policy_reuse", "residual_policy")
+    if steered and curriculum == "off":
+        return False
+    if transfer == "residual_policy" and boosting != "off":
+        return False
+    if algorithm == "fqi":
+        return not steered and "released" not in boosting + transfer
+    return True
 
 
 @pytest.mark.parametrize("env", GROUPS["env"])
-@pytest.mark.parametrize("budget", [None, *GROUPS["budget"]])
-def test_every_combination_composes_or_is_refused_with_a_reason(env, budget):
-    fixed = [f"env={env}"] + ([f"budget={budget}"] if budget else [])
-    for options in itertools.product(*(GROUPS[g] for g in ENV_LESS)):
-        choice = dict(zip(ENV_LESS, options, strict=True))
-        ended = outcome([*fixed, *(f"{g}={o}" for g, o in choice.items())])
-        tabular_hill = env == "car_on_hill" and options[-1] == "tabular"
-        foreign_budget = env == "car_on_hill" and budget == "maze_fqi"
-        foreign_budget |= env == "maze" and budget == "car_on_hill_fqi"
-        assert (ended == "refused") == (tabular_hill or foreign_budget), choice
+@pytest.mark.parametrize("algorithm", GROUPS["algorithm"])
+def test_every_combination_composes_or_is_refused_with_a_reason(env, algorithm):
+    groups = ("curriculum", "boosting", "transfer")
+    names = {}
+    for options in itertools.product(*(GROUPS[g] for g in groups)):
+        chosen = [f"{g}={o}" for g, o in zip(groups, options, strict=True)]
+        ended = outcome([f"env={env}", f"algorithm={algorithm}", *chosen])
+        assert (ended != "refused") == sensible(env, algorithm, *options), options
+        names.setdefault(ended, []).append(options)
+    del names["refused"]
+    # A name means one thing, and a mixture of readings has a directory of its own.
+    assert all(len(options) == 1 for options in names.values()), names
+
+
+@pytest.mark.parametrize("env", GROUPS["env"])
+def test_every_regressor_and_budget_composes_or_is_refused_with_a_reason(env):
+    for regressor, scale in itertools.product(
+        GROUPS["algorithm/regressor"], GROUPS["scale"]
+    ):
+        ended = outcome(
+            [f"env={env}", f"algorithm/regressor={regressor}", f"scale={scale}"]
+        )
+        assert (ended == "refused") == (regressor == "tabular" and env != "maze")
+    for budget in GROUPS["budget"]:
+        belongs, algorithm = budget.rsplit("_", 1)
+        ended = outcome([f"env={env}", f"algorithm={algorithm}", f"budget={budget}"])
+        lengths = {"car_on_hill": 3, "linear_system": 2, "maze": 10}
+        if belongs == env or budget in ("car_on_hill_dqn", "maze_dqn"):  # one value
+            assert ended != "refused"
+        else:
+            assert ended == "refused" or lengths[belongs] == lengths[env]
 
 
 @pytest.mark.parametrize("experiment", GROUPS["experiment"])
-def test_every_experiment_composes_at_every_scale_with_every_option(experiment):
+def test_every_experiment_composes_at_every_scale(experiment):
     for scale in GROUPS["scale"]:
-        for regressor in GROUPS["algorithm/regressor"]:
-            chosen = (f"scale={scale}", f"algorithm/regressor={regressor}")
-            ended = outcome([f"experiment={experiment}", *chosen])
-            refused = regressor == "tabular" and experiment in (
-                "fig1",
-                "fig1_released",
-                "fig2_released",  # its maze leaves the lattice
-            )
-            assert (ended == "refused") == refused, (scale, regressor, ended)
+        assert outcome([f"experiment={experiment}", f"scale={scale}"]) != "refused"
+
+
+DQN_VARIANTS = {
+    "plain": ("DQN", (), [DQN]),
+    "C": ("C-DQN", (warm_start,), [DQN, DQN]),
+    "BC": ("BC-DQN", (Boost(),), [LSPI, DQN]),
+    "SC": ("SC-DQN", (Shape(),), [LSPI, DQN]),
+    "SBC": ("SBC-DQN", (Boost(), Shape()), [LSPI, DQN]),
+    "RPL": ("RPL", (ResidualPolicy(2000),), [LSPI, DQN]),
+    "PPR": ("PPR", (PolicyReuse(0.998),), [LSPI, DQN]),
+    "BC_released": ("BC-DQN@released", (Boost("residual", "two", False),), [LSPI, DQN]),
+    "SC_released": ("SC-DQN@released", (Shape("before_reset", False),), [LSPI, DQN]),
+    "SBC_released": (
+        "SBC-DQN@released",
+        (Boost("residual", "two", False), Shape("before_reset", False)),
+        [LSPI, DQN],
+    ),
+    "B": ("B-DQN", (Boost(),), [DQN, DQN]),
+}
+TARGET_UPDATE = {"plain": 200, "C": 25, "RPL": 25, "PPR": 200}
+
+
+@pytest.mark.parametrize("variant", DQN_VARIANTS)
+def test_the_linear_systems_methods(variant):
+    name, transfers, learners = DQN_VARIANTS[variant]
+    p = plan("env=linear_system", "algorithm=dqn", f"variant={variant}")
+    assert p.name == name and p.family == "DQN"
+    assert [type(s.learner) for s in p.stages] == learners
+    assert p.stages[-1].transfers == (transfers or (warm_start,))
+    last = p.stages[-1].learner
+    usual = 4000 if "S" in variant else 2000
+    assert last.target_update == TARGET_UPDATE.get(variant, usual)
+    random = sum(getattr(s.learner, "random_steps", 0) for s in p.stages)
+    assert p.length == 40_000 + random
+    assert random == (500 if variant in ("plain", "C", "SC", "SC_released", "B") else 0)
+
+
+def test_choosing_the_groups_is_the_same_as_naming_the_variant():
+    for named, groups in (
+        ("BC", ("curriculum=on", "boosting=on")),
+        (
+            "SBC_released",
+            ("curriculum=on", "boosting=released", "transfer=shaping_released"),
+        ),
+        ("PPR", ("curriculum=on", "transfer=policy_reuse")),
+    ):
+        here = plan("env=linear_system", "algorithm=dqn", f"variant={named}")
+        there = plan("env=linear_system", "algorithm=dqn", *groups)
+        assert (here.name, here.stages) == (there.name, there.stages)
+    one = ("env=linear_system", "algorithm=dqn", "variant=BC", "boosting.maxima=two")
+    assert plan(*one).name.startswith("BC-DQN@")
+
+
+def test_a_tuning_seed_reports_nothing():
+    tuned = {s for p in plans("experiment=search_nu") for s in p.seeds}
+    assert tuned and not tuned & set(
+        range(plan("env=linear_system", "scale=paper").seeds[-1] + 1)
+    )
 
 
 def test_a_users_folder_adds_options_of_its_own(tmp_path):
@@ -171,4 +258,6 @@ def test_a_users_folder_adds_options_of_its_own(tmp_path):
     (tmp_path / "budget" / "low_maze_fqi.yaml").write_text(budget)
     (low_maze,) = plans("env=low_maze", "curriculum=on", config_dir=str(tmp_path))
     assert low_maze.directory == Path("runs/quick/low_maze/C-FQI")
-    assert low_maze.target.height == 0.9 and low_maze.stages[-1].iterations == 50
+    assert (
+        low_maze.target.height == 0.9 and low_maze.stages[-1].learner.iterations == 50
+    )

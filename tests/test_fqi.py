@@ -6,26 +6,36 @@ import numpy as np
 import pytest
 
 from bcrl.bellman import residual_target
-from bcrl.learners.fqi import FQI, Stage
+from bcrl.learners.fqi import FQI
 from bcrl.oracle.maze import optimal_q
 from bcrl.q import ZERO, Sum, Table, Zero, add
 from bcrl.q.regressors import ForestRegressor, Tabular
 from bcrl.rollout import transition_tables
-from bcrl.transfer import boost, warm_start
+from bcrl.stage import Stage, Team
+from bcrl.stage import learn as learn_stages
+from bcrl.transfer import Boost, Learned, Shape, begin, warm_start
 from tests.toys import Corridor, OpenCorridor
 
 
-def stages(tasks, iterations=120, new_data=(True, True), episodes=60):
-    return [
-        Stage(i + 1, i + 1, env, iterations, episodes, 1.0, new_data[i])
-        for i, env in enumerate(tasks)
-    ]
+def stages(
+    tasks,
+    transfers=(warm_start,),
+    regressor=None,
+    iterations=120,
+    new_data=(True, True),
+    **options,
+):
+    made = []
+    for i, env in enumerate(tasks):
+        fits = {"regressor": regressor or Tabular(), "new_data": new_data[i]} | options
+        learner = FQI(iterations, 60, **fits)
+        made.append(Stage(i + 1, i + 1, env, learner, transfers, i * iterations))
+    return made
 
 
-def learn(tasks, transfer, regressor=None, seeds=(0, 1), **options):
-    learner = FQI(seeds, regressor or Tabular(), transfer)
-    every = Corridor().states()
-    return list(learner.run(stages(tasks, **options), every)), learner
+def learn(tasks, *transfers, seeds=(0, 1), **options):
+    team = Team(seeds, Corridor().states())
+    return list(learn_stages(stages(tasks, transfers, **options), team))
 
 
 def test_the_target_is_equation_5_by_hand():
@@ -39,10 +49,12 @@ def test_the_target_is_equation_5_by_hand():
     assert y.tolist() == [1.0 + 0.5 * 4.0 - 0.5, -2.0 - 0.25]
 
 
-@pytest.mark.parametrize("transfer", [boost, warm_start])
-def test_with_an_exact_regressor_it_is_value_iteration(transfer):
+@pytest.mark.parametrize(
+    "transfers", [(Boost(),), (warm_start,), (Shape(),), (Boost(), Shape())]
+)
+def test_with_an_exact_regressor_it_is_value_iteration(transfers):
     tasks = [Corridor(prize=-1.0), Corridor(prize=3.0)]
-    snapshots, _ = learn(tasks, transfer)
+    snapshots = learn(tasks, *transfers)
     q_star = optimal_q(*transition_tables(tasks[-1]), tasks[-1].gamma)
     for q in snapshots[-1].probed_q:
         assert np.allclose(q[:5], q_star[:5], atol=1e-5)  # cell 5 ends the episode
@@ -50,7 +62,7 @@ def test_with_an_exact_regressor_it_is_value_iteration(transfer):
 
 def test_boosting_learns_the_difference_between_two_tasks():
     tasks = [Corridor(prize=1.0), Corridor(prize=3.0)]
-    snapshots, _ = learn(tasks, boost)
+    snapshots = learn(tasks, Boost())
     first = next(x for x in snapshots if x.last_of_stage)
     last = snapshots[-1]
     for s in range(2):
@@ -60,50 +72,50 @@ def test_boosting_learns_the_difference_between_two_tasks():
 
 
 def test_a_boosted_stage_starts_at_the_previous_q_and_a_zero_residual():
-    previous = Table([np.ones((6, 2))], Corridor().index)
-    assert boost(previous).base is previous and boost(previous).initial is ZERO
-    assert (
-        warm_start(previous).base is ZERO and warm_start(previous).initial is previous
-    )
+    q, residual = (Table([np.full((6, 2), x)], Corridor().index) for x in (2.0, 1.0))
+    previous = Learned(q, residual)
+    boosted = begin([Boost()], previous)
+    assert boosted.base is q and boosted.initial is ZERO
+    warm = begin([warm_start], previous)
+    assert warm.base is ZERO and warm.initial is residual
 
 
 def test_tabulated_and_general_evaluation_agree_with_the_same_forests():
-    trees = ForestRegressor(trees=5)
-    fast, _ = learn([Corridor(), Corridor(prize=2.0)], boost, trees, iterations=4)
-    plain, _ = learn(
-        [OpenCorridor(), OpenCorridor(prize=2.0)], boost, trees, iterations=4
-    )
-    states = Corridor().states()
-    for a, b in zip(fast, plain, strict=True):
-        for s in range(2):
-            seen = a.probed_q[s]
-            asked = b.q([states, states], 2)[s]
-            # The table asks for all cells, the general way for those in the data.
-            assert np.allclose(seen[:5], asked[:5], atol=1e-12)
+    options = {"regressor": ForestRegressor(trees=5), "iterations": 4}
+    for transfers in ([Boost()], [Boost(), Shape()]):
+        fast = learn([Corridor(), Corridor(prize=2.0)], *transfers, **options)
+        open_tasks = [OpenCorridor(), OpenCorridor(prize=2.0)]
+        plain = learn(open_tasks, *transfers, **options)
+        states = Corridor().states()
+        for a, b in zip(fast, plain, strict=True):
+            for s in range(2):
+                seen = a.probed_q[s]
+                asked = b.learned.q([states, states], 2)[s]
+                # The table asks for all cells, the general way for those in the data.
+                assert np.allclose(seen[:5], asked[:5], atol=1e-12)
 
 
 def test_an_action_never_tried_keeps_its_approximator():
-    learner = FQI((0,), Tabular(), warm_start)
-    first, second = stages([Corridor(), Corridor(prize=5.0)], iterations=3)
-    before = list(learner.run([first], Corridor().states()))[-1]
-    sets = learner._datasets[0]
+    first, second = stages(
+        [Corridor(), Corridor(prize=5.0)], iterations=3, new_data=(True, False)
+    )
+    team = Team((0,), Corridor().states())
+    *_, before = learn_stages([first], team)
+    (sets,) = before.learned.data
     left, right = sets.by_action
     starved = replace(left, rows=np.empty(0, np.intp))
-    learner._datasets = [replace(sets, by_action=(starved, right))]
-    *_, after = learner._learn(second, before.q, 3)
+    data = [replace(sets, by_action=(starved, right))]
+    start = begin([warm_start], replace(before.learned, data=data))
+    *_, after = second.learner.learn(second, start, team)
     assert np.array_equal(after.probed_q[0][:, 0], before.probed_q[0][:, 0])
     assert not np.array_equal(after.probed_q[0][:, 1], before.probed_q[0][:, 1])
 
 
 def test_a_kept_dataset_is_not_collected_again():
-    learner = FQI((0,), Tabular(), warm_start)
-    seen = []
-    for snapshot in learner.run(
-        stages([Corridor()] * 2, 2, (True, False)), Corridor().states()
-    ):
-        seen.append((snapshot.iteration, learner._datasets))
-    assert seen[0][1] is seen[-1][1]
-    assert [i for i, _ in seen] == [1, 2, 3, 4]
+    options = {"iterations": 2, "new_data": (True, False), "seeds": (0,)}
+    snapshots = learn([Corridor()] * 2, warm_start, **options)
+    assert snapshots[0].learned.data is snapshots[-1].learned.data
+    assert [x.count for x in snapshots] == [1, 2, 3, 4]
 
 
 class Recorder(Tabular):
@@ -120,8 +132,7 @@ class Recorder(Tabular):
 def drawn(**options) -> np.ndarray:
     """First draws of the fits, shape (iterations of both stages, seeds, actions)."""
     recorder = Recorder()
-    learner = FQI((0, 1), recorder, boost, **options)
-    list(learner.run(stages([Corridor()] * 2, iterations=3), Corridor().states()))
+    learn([Corridor()] * 2, Boost(), regressor=recorder, iterations=3, **options)
     return np.array(recorder.draws).reshape(6, 2, 2)
 
 
@@ -136,16 +147,16 @@ def test_the_released_option_fixes_a_seeds_randomness_in_all_its_fits():
 
 
 def test_the_released_option_shares_one_dataset_a_task():
-    own = FQI((0, 1), Tabular(), warm_start)
-    shared = FQI((0, 1), Tabular(), warm_start, shared_data=True)
-    later = FQI((5,), Tabular(), boost, shared_data=True)
-    (stage,) = stages([Corridor()], iterations=1, new_data=(True,))
-    for learner in (own, shared, later):
-        list(learner.run([stage], Corridor().states()))
-    counts = [learner._datasets for learner in (own, shared, later)]
-    assert not np.array_equal(counts[0][0].multiplicity, counts[0][1].multiplicity)
-    assert counts[1][0] is counts[1][1]
-    assert np.array_equal(counts[1][0].multiplicity, counts[2][0].multiplicity)
+    def counts(seeds, *transfers, **options):
+        (last,) = learn([Corridor()], *transfers, seeds=seeds, iterations=1, **options)
+        return [x.multiplicity for x in last.learned.data]
+
+    own = counts((0, 1), warm_start)
+    shared = counts((0, 1), warm_start, shared_data=True)
+    later = counts((5,), Boost(), shared_data=True)
+    assert not np.array_equal(own[0], own[1])
+    assert shared[0] is shared[1]
+    assert np.array_equal(shared[0], later[0])
 
 
 def test_sums_flatten_and_drop_zeros():

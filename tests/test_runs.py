@@ -17,8 +17,8 @@ import pytest
 
 from bcrl import runner
 from bcrl.errors import BcrlError, ConfigError
-from bcrl.learners.fqi import FQI
 from bcrl.records import is_complete
+from bcrl.stage import Team, learn
 from tests.conftest import plan
 
 COLUMNS = {
@@ -134,8 +134,7 @@ def test_seeds_differ_in_data_and_in_trees(tmp_path):
 def test_measuring_leaves_training_unchanged(tmp_path):
     """A learner that nobody evaluates ends with the same Q, to the bit."""
     measured = run(tmp_path, "maze", "on", "on")
-    learner = FQI((0, 1), measured.regressor, measured.transfer)
-    *_, last = learner.run(measured.stages, measured.target.states())
+    *_, last = learn(measured.stages, Team((0, 1), measured.target.states()))
     for seed in (0, 1):
         assert np.array_equal(last.probed_q[seed], final_q(measured, seed))
 
@@ -194,7 +193,9 @@ class Broken:
 
 def test_an_error_in_a_worker_ends_the_run_with_its_message(tmp_path):
     p = plan("env=maze", "scale=smoke", "progress=none", f"runs_dir={tmp_path}")
-    broken = replace(p, regressor=Broken(), config=p.config | {"workers": 2})
+    learner = replace(p.stages[0].learner, regressor=Broken())
+    stages = (replace(p.stages[0], learner=learner),)
+    broken = replace(p, stages=stages, config=p.config | {"workers": 2})
     with pytest.raises(ConfigError, match="key=1: must be 2"):
         runner.run(broken)
     assert not list(p.directory.glob("seed_*"))

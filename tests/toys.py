@@ -1,4 +1,4 @@
-"""A small finite environment for tests: a corridor with a goal at one end."""
+"""For tests: a corridor with a goal at one end, and stages by themselves."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+
+from bcrl.stage import Stage, Team
 
 
 @dataclass(frozen=True)
@@ -46,3 +48,19 @@ class OpenCorridor(Corridor):
     """The same corridor without its list of states being used: not tabulated."""
 
     finite: ClassVar[bool] = False
+
+
+def staged(learner, env, number=1, before=0):
+    """A stage of `learner` in `env` by itself."""
+    return Stage(number, number, env, learner, (), before)
+
+
+def team(*seeds):
+    """Seeds that train together, with nothing to look at."""
+    return Team(seeds, np.zeros((1, 1)))
+
+
+def last(moments):
+    """The last of what a learner yields, evaluating none."""
+    *_, moment = moments
+    return moment

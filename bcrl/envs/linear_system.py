@@ -22,7 +22,7 @@ ACTION_COST = 0.1  # per squared unit of force, LQ task
 START = np.array([-4.0, 0.0, 0.0, 0.0])
 DIAGONAL = np.sqrt(0.5)
 ACTIONS = np.array(
-    [[1, 0], [-1, 0], [0, 1], [0, -1]]
+    [[1, 0], [0, 1], [-1, 0], [0, -1]]
     + [[a * DIAGONAL, b * DIAGONAL] for a in (1, -1) for b in (1, -1)]
 )
 VELOCITIES, POSITIONS = (1, 3), (0, 2)
@@ -56,7 +56,7 @@ class LinearSystem:
     | | |
     |---|---|
     | observation | (x, ẋ, y, ẏ), dimensionless |
-    | actions | unit forces: 0–3 +x, −x, +y, −y; 4–7 (+,+), (+,−), (−,+), (−,−) |
+    | actions | unit forces: 0–3 +x, +y, −x, −y; 4–7 (+,+), (+,−), (−,+), (−,−) |
     | dynamics | x' = ẋ, ẋ' = −friction ẋ + gain F_x, same for y; noise N(0, 1e-5²) on each derivative; Euler steps of 0.05 s |
     | `task=lq` | reward −s'ᵀ diag(3, 1, 3, 1) s' − 0.1 ‖F‖²; horizon 100; never absorbing |
     | `task=target` | `drift` is added to x'; walls at x = −5 and x = 1 reflect; whoever ends a step with \\|y\\| > 0.5 is put back to a fresh start (not absorbing); reward 0 and absorbing if ‖(x, y)‖ < 0.2, else −1; horizon 150 |
@@ -175,10 +175,12 @@ class LinearSystem:
         beyond = (x < low) | (x > high)
         if not beyond.any():
             return moved
-        # Up to the contact in a straight line, then on without force and drift.
+        # Up to the contact in a straight line, then on without force and drift. Where
+        # the drift overcame the velocity, mirroring leads outside by a little: share 0.
         wall = xp.where(x < low, low, high)
-        step = xp.where(beyond, x - state[..., 0], 1.0)
-        share = xp.where(beyond, (wall - state[..., 0]) / step, 1.0)[..., None]
+        step = xp.where(x == state[..., 0], 1.0, x - state[..., 0])
+        share = xp.clip((wall - state[..., 0]) / step, 0.0, 1.0)
+        share = xp.where(beyond, share, 1.0)[..., None]
         contact = state + share * (moved - state)
         contact[..., 1] = -contact[..., 1]
         onward = contact + (1.0 - share) * DT * self._derivative(contact)

@@ -30,9 +30,9 @@ class DQN:
     """DQN's settings for one stage; steps are environment steps (paper, C.3).
 
     `random_steps` uniformly random ones come before the `steps`. ε falls from
-    `epsilon_start` to `epsilon` over the first `anneal_steps` of the steps. One update a
-    step once the replay holds more than `learning_starts` transitions; the target is
-    copied every `target_update` steps, random ones counted.
+    `epsilon_start` to `epsilon` over the first `anneal_steps` of the steps. One update
+    comes with each step once the replay holds more than `learning_starts` transitions;
+    the target is copied every `target_update` steps, random ones counted.
     """
 
     steps: int = 10_000

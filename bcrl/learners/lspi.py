@@ -107,11 +107,14 @@ def lstdq(
 ) -> NDArray[np.float64]:
     """Weights θ with Φᵀ(Φ − γΦ') θ = Φᵀ r; the pseudo-inverse's if that is singular.
 
-    z and after (n, m) are state-actions and the policy's at the next states.
+    z and after (n, m) are state-actions and the policy's at the next states. Data that
+    overflow give nan.
     """
     phi = features(z, settings.features)
     a = phi.T @ (phi - gamma * features(after, settings.features))
     b = phi.T @ reward
+    if not np.isfinite(a).all() or not np.isfinite(b).all():
+        return np.full(len(b), np.nan)
     if np.linalg.matrix_rank(a) == len(a):
         return np.linalg.solve(a, b)
     return np.linalg.pinv(a) @ b

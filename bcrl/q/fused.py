@@ -112,8 +112,8 @@ def adam(parameters, gradient, first, second, beta1, beta2, rate, scale, eps):
 def update(online, target, moments, sizes, rows, places, layout, constants, loss):
     """One DQN update of S seeds, in place; adds each one's mean loss to `loss` (S,).
 
-    online, target (S, P); moments (2, S, P); rows (S, capacity, width) as `Replay` packs
-    them; places (S, B) rows of each seed's own; layout: d and A; constants: Adam's.
+    online, target (S, P); moments (2, S, P); rows (S, capacity, width) packed by
+    `Replay`; places (S, B) rows of each seed's own; layout: d and A; constants: Adam's.
     """
     d, n_actions = layout
     beta1, beta2, rate, scale, eps = constants

@@ -65,7 +65,7 @@ class Networks:
         return Networks(self.sizes, self.flat.clone())
 
     def forward(self, x: Tensor) -> Tensor:
-        """Outputs (S, n, out); the buffer is used again by the next call with this n."""
+        """Outputs (S, n, out), in a buffer that the next call with n overwrites."""
         n = x.shape[1]
         if n not in self._buffers:
             widths = self.sizes[1:]

@@ -1,0 +1,251 @@
+"""The linear system's two tasks, recomputed number by number from the specification."""
+
+import math
+import statistics
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bcrl.envs.linear_system import LinearSystem
+from bcrl.errors import ConfigError
+
+#: (preset, task): gain, friction, half-widths of the start's box
+SPECIFIED = {
+    ("released", "lq"): (2.0, 0.1, (0.3, 0.3, 0.3, 0.3)),
+    ("released", "target"): (2.0, 1.0, (1e-3, 0.1, 0.4, 0.1)),
+    ("paper", "lq"): (1.0, 0.1, (0.0, 0.3, 0.0, 0.3)),
+    ("paper", "target"): (1.0, 0.1, (0.0, 0.1, 0.4, 0.1)),
+}
+ALL = pytest.mark.parametrize(("preset", "task"), list(SPECIFIED))
+
+
+def env_of(preset, task, **options):
+    return LinearSystem(task, preset=preset, **options)
+
+
+def start_by_hand(preset, task, u):
+    _, _, box = SPECIFIED[preset, task]
+    centre = (-4.0, 0.0, 0.0, 0.0)
+    return [c - h + 2.0 * h * v for c, h, v in zip(centre, box, u, strict=True)]
+
+
+def step_by_hand(preset, task, state, force, u):
+    """One step in plain floats: next state, reward, absorbing, what happened."""
+    gain, friction, _ = SPECIFIED[preset, task]
+    x, vx, y, vy = state
+    z = [statistics.NormalDist().inv_cdf(v) * 1e-5 for v in u[:4]]
+    drift = -0.5 if task == "target" else 0.0
+    new = [
+        x + 0.05 * (vx + drift + z[0]),
+        vx + 0.05 * (-friction * vx + gain * force[0] + z[1]),
+        y + 0.05 * (vy + z[2]),
+        vy + 0.05 * (-friction * vy + gain * force[1] + z[3]),
+    ]
+    if task == "lq":
+        cost = sum(w * s * s for w, s in zip((3, 1, 3, 1), new, strict=True))
+        cost += 0.1 * (force[0] ** 2 + force[1] ** 2)
+        return new, -cost, False, "lq"
+    event = "free"
+    for wall, outside in ((-5.0, new[0] < -5.0), (1.0, new[0] > 1.0)):
+        if outside:
+            event = f"wall {wall}"
+            share = (wall - x) / (new[0] - x)
+            at = [a + share * (b - a) for a, b in zip(state, new, strict=True)]
+            at[1] = -at[1]
+            rest = 0.05 * (1.0 - share)
+            slope = (at[1], -friction * at[1], at[3], -friction * at[3])
+            new = [a + rest * b for a, b in zip(at, slope, strict=True)]
+    if abs(new[2]) > 0.5:
+        new, event = start_by_hand(preset, task, u[4:]), "reset"
+    success = math.hypot(new[0], new[2]) < 0.2
+    return new, 0.0 if success else -1.0, success, "goal" if success else event
+
+
+def anywhere(n, seed=0):
+    """Random states between the walls, fast ones too, many where something happens."""
+    rng = np.random.default_rng(seed)
+    state = rng.standard_normal((n, 4)) * [0.0, 4.0, 0.0, 2.0]
+    state[:, 0] = rng.choice([-4.95, -2.0, 0.0, 0.9], n) + rng.uniform(-0.05, 0.1, n)
+    state[:, 2] = rng.choice([-0.45, 0.0, 0.45], n) + rng.uniform(-0.05, 0.05, n)
+    return state, rng.integers(8, size=n), rng.random((n, 8))
+
+
+@ALL
+def test_a_step_is_the_specifications_number_by_number(preset, task):
+    env, (state, action, noise) = env_of(preset, task), anywhere(3000)
+    after, reward, absorbing = env.step(state, action, noise)
+    events = set()
+    for i, act in enumerate(action):
+        force = env.actions[act].tolist()
+        found = step_by_hand(preset, task, state[i].tolist(), force, noise[i].tolist())
+        assert after[i].tolist() == pytest.approx(found[0], abs=1e-12)
+        assert reward[i] == pytest.approx(found[1], rel=1e-12)
+        assert absorbing[i] == found[2]
+        events.add(found[3])
+    everything = {"free", "wall -5.0", "wall 1.0", "reset", "goal"}
+    assert events == ({"lq"} if task == "lq" else everything)
+
+
+@ALL
+def test_a_push_takes_any_force_and_a_step_is_a_push_of_unit_length(preset, task):
+    env, (state, action, noise) = env_of(preset, task), anywhere(200, seed=1)
+    force = np.random.default_rng(2).standard_normal((200, 2))
+    after, reward, _ = env.push(state, force, noise)
+    for i in range(200):
+        found = step_by_hand(
+            preset, task, *(x[i].tolist() for x in (state, force, noise))
+        )
+        assert after[i].tolist() == pytest.approx(found[0], abs=1e-12)
+        assert reward[i] == pytest.approx(found[1], rel=1e-12)
+    for one, other in zip(
+        env.step(state, action, noise),
+        env.push(state, env.actions[action], noise),
+        strict=True,
+    ):
+        assert np.array_equal(one, other)
+    assert np.allclose(np.linalg.norm(env.actions, axis=1), 1.0)
+
+
+def test_a_reflection_by_hand():
+    # x̄ = 0.95 + 0.05 (2.5 − 0.5) = 1.05, halfway through the step the wall is met with
+    # ẋ = 2.5 + (−0.125 + 0.1) / 2 = 2.4875; then 0.025 s at −2.4875, friction 1.
+    env, rest = LinearSystem(), np.full(8, 0.5)
+    force = np.array([1.0, 0.0])
+    after, reward, _ = env.push(np.array([0.95, 2.5, 0.3, 0.0]), force, rest)
+    expected = [1.0 - 0.025 * 2.4875, -2.4875 + 0.025 * 2.4875, 0.3, 0.0]
+    assert after.tolist() == pytest.approx(expected, abs=1e-12)
+    assert reward == -1.0
+
+
+def test_the_eight_actions_in_their_order():
+    half = math.sqrt(0.5)
+    expected = [(1, 0), (0, 1), (-1, 0), (0, -1)]
+    expected += [(half, half), (half, -half), (-half, half), (-half, -half)]
+    assert LinearSystem().actions.tolist() == [pytest.approx(x) for x in expected]
+
+
+@ALL
+def test_the_start_box(preset, task):
+    env, u = env_of(preset, task), np.random.default_rng(3).random((500, 4))
+    for found, v in zip(env.initial(u), u, strict=True):
+        assert found.tolist() == pytest.approx(
+            start_by_hand(preset, task, v), abs=1e-14
+        )
+    box = np.array(SPECIFIED[preset, task][2])
+    corner = np.array([-4.0, 0.0, 0.0, 0.0])
+    assert np.allclose(env.initial(np.zeros((1, 4)))[0], corner - box)
+    assert np.allclose(env.initial(np.full((1, 4), 1.0))[0], corner + box)
+
+
+def test_who_leaves_the_path_starts_anew_and_before_reset_knows_where_from():
+    env, (state, action, noise) = LinearSystem(), anywhere(3000, seed=4)
+    after, _, absorbing = env.step(state, action, noise)
+    left = env.before_reset(state, action, noise)
+    off = np.abs(left[:, 2]) > 0.5
+    assert 100 < off.sum() < 2900
+    assert np.array_equal(after[off], env.initial(noise[off, 4:]))
+    assert np.array_equal(after[~off], left[~off])
+    assert not absorbing[off].any()
+    assert not (after[~off] == env.initial(noise[~off, 4:])).all(-1).any()
+
+
+@ALL
+def test_numpy_and_torch_give_the_same_numbers(preset, task):
+    env, (state, action, noise) = env_of(preset, task), anywhere(1000, seed=5)
+    arrays = [torch.from_numpy(x) for x in (state, action, noise)]
+    for one, other in zip(
+        env.step(state, action, noise), env.step(*arrays), strict=True
+    ):
+        assert np.allclose(one, other.numpy(), rtol=1e-12, atol=1e-12)
+        assert (one.dtype == bool) == (other.dtype == torch.bool)
+    left = env.before_reset(*arrays).numpy()
+    assert np.allclose(env.before_reset(state, action, noise), left, atol=1e-12)
+    start = env.initial(torch.from_numpy(noise[:, :4])).numpy()
+    assert np.allclose(env.initial(noise[:, :4]), start, atol=1e-15)
+
+
+@ALL
+def test_a_batch_steps_as_its_lanes_do(preset, task):
+    env, (state, action, noise) = env_of(preset, task), anywhere(60, seed=6)
+    shaped = (
+        state.reshape(3, 4, 5, 4),
+        action.reshape(3, 4, 5),
+        noise.reshape(3, 4, 5, 8),
+    )
+    together = env.step(*shaped)
+    for i in range(60):
+        alone = env.step(state[i], action[i], noise[i])
+        lane = np.unravel_index(i, (3, 4, 5))
+        for a, b in zip(together, alone, strict=True):
+            assert np.array_equal(a[lane], b)
+
+
+@ALL
+@pytest.mark.parametrize("library", [np.asarray, torch.from_numpy])
+def test_the_rarest_uniforms_give_finite_noise(preset, task, library):
+    state, action, _ = anywhere(4)
+    for u in (0.0, 1.0 - 2.0**-53):
+        arrays = (library(x) for x in (state, action, np.full((4, 8), u)))
+        after, reward, _ = env_of(preset, task).step(*arrays)
+        assert np.isfinite(np.asarray(after)).all()
+        assert np.isfinite(np.asarray(reward)).all()
+
+
+@pytest.mark.parametrize("preset", ["released", "paper"])
+def test_under_any_policy_the_mass_stays_near_the_walls_and_finite(preset):
+    env, rng = LinearSystem(preset=preset), np.random.default_rng(7)
+    state, action = env.initial(rng.random((500, 4))), rng.integers(8, size=500)
+    for t in range(400):
+        if t % 20 == 0:
+            action = rng.integers(8, size=500)
+        state, _, _ = env.step(state, action, rng.random((500, 8)))
+        assert ((state[:, 0] > -5.05) & (state[:, 0] < 1.05)).all()
+        assert (np.abs(state[:, 1]) < 6.0).all()
+        assert (np.abs(state[:, 2]) <= 0.5).all()
+
+
+@pytest.mark.parametrize(
+    ("key", "bad"),
+    [
+        ("task", "lqr"),
+        ("preset", "relesed"),
+        ("gamma", 1.0),
+        ("gamma", -0.1),
+        ("gamma", math.nan),
+        ("horizon", 0),
+    ],
+)
+def test_impossible_constants_are_refused_by_name(key, bad):
+    with pytest.raises(ConfigError, match=rf"env\.{key}={bad}"):
+        LinearSystem(**{key: bad})
+
+
+@ALL
+def test_the_horizon_is_not_the_steps_business(preset, task):
+    env, sample = env_of(preset, task), anywhere(100, seed=8)
+    for a, b in zip(
+        env.step(*sample), replace(env, horizon=1).step(*sample), strict=True
+    ):
+        assert np.array_equal(a, b)
+
+
+def test_the_lq_task_never_ends_and_has_neither_walls_nor_path():
+    env = LinearSystem("lq")
+    state = np.array([[0.0, 0, 0, 0], [-9.0, -2, 0, 0], [2.0, 3, 0, 0], [0.0, 0, 3, 0]])
+    after, _, absorbing = env.step(state, np.zeros(4, int), np.full((4, 8), 0.5))
+    assert not absorbing.any()
+    assert np.allclose(after[:, 0], state[:, 0] + 0.05 * state[:, 1])
+
+
+@pytest.mark.parametrize("preset", ["released", "paper"])
+def test_the_lq_matrices_are_those_of_a_step(preset):
+    env, rng = env_of(preset, "lq"), np.random.default_rng(9)
+    a, b, q, r = env.linear_quadratic
+    assert env_of(preset, "target").linear_quadratic is None
+    for _ in range(20):
+        s, f = rng.standard_normal(4), rng.standard_normal(2)
+        after, reward, _ = env.push(s, f, np.full(8, 0.5))
+        assert np.allclose(after, a @ s + b @ f, atol=1e-14)
+        assert reward == pytest.approx(-after @ q @ after - f @ r @ f, rel=1e-12)
