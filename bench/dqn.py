@@ -1,8 +1,8 @@
 """DQN in seed-lockstep against one seed in plain torch: python bench/dqn.py
 
 Both learn the linear system's target task with the paper's settings, on one core, by
-turns: environment, exploration, replay, update; evaluation is timed apart. The plain
-way is a `torch.nn` network with autograd, `torch.optim.Adam`, a NumPy replay and the same
+turns: environment, exploration, replay, update; evaluation is timed apart. Plain is a
+`torch.nn` network with autograd, `torch.optim.Adam`, a NumPy replay and the same
 environment with one lane. Microseconds of CPU a seed and environment step, while both
 make an update a step.
 """

@@ -253,12 +253,15 @@ class _Run:
 
     def moment(self, step: int) -> Moment:
         """What there is to see after `step` steps of the stage."""
+        lost = ~torch.isfinite(self.deep.online.flat).all(1).cpu().numpy()
+        failed = {int(s): "non-finite weights" for s in np.flatnonzero(lost)}
+        for s in np.flatnonzero(~np.isfinite(self.loss)):
+            failed.setdefault(int(s), "non-finite loss")
         loss = self.loss / self.updates if self.updates else self.loss + np.nan
         self.loss, self.updates = np.zeros_like(loss), 0
         q: Q = add(self.start.base, self.deep)
         if self.start.shape is not None:
             q = Raised(q, self.start.potential)
-        bad = ~torch.isfinite(self.deep.online.flat).all(1).cpu().numpy()
         return Moment(
             self.stage,
             self.stage.before + step,
@@ -267,7 +270,7 @@ class _Run:
             self._policy(step),
             self.settings.evaluation_episodes,
             loss,
-            {int(s): "non-finite weights" for s in np.flatnonzero(bad)},
+            failed,
         )
 
     def _policy(self, step: int) -> Policy:

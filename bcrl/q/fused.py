@@ -144,7 +144,7 @@ def update(online, target, moments, sizes, rows, places, layout, constants, loss
         for b in range(n):
             a = int(rows[s, places[s, b], end + 2])
             error = values[b, a] - y[b]
-            clipped = min(max(error, -one), one)
+            clipped = one if error > one else -one if error < -one else error  # or nan
             slope[b, a] = clipped / np.float32(n)
             total_loss += clipped * (error - np.float32(0.5) * clipped)
         loss[s] += total_loss / n
