@@ -12,19 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from bcrl import probes
-from bcrl.algorithms import Composition, Plain, algorithm
+from bcrl.algorithms import algorithm
+from bcrl.composition import Composition, Plain, composition
 from bcrl.config import OUTPUT_KEYS, Choice, Config, construct, one_of
-from bcrl.curriculum import CURRICULA
 from bcrl.envs import Env, env_class
 from bcrl.errors import ConfigError, at_least, did_you_mean
 from bcrl.stage import Stage
-from bcrl.transfer import (
-    TRANSFERS,
-    Boost,
-    PolicyReuse,
-    ResidualPolicy,
-    Shape,
-)
+from bcrl.transfer import PolicyReuse, ResidualPolicy, Shape
 
 
 @dataclass(frozen=True)
@@ -110,7 +104,7 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
         raise ConfigError("algorithm", section, "must be a section with a name")
     name = section.get("name")
     chosen_algorithm = algorithm(name)
-    chosen = _composition(config, tasks)
+    chosen = composition(config, tasks)
     stages = chosen_algorithm.stages(section, chosen)
     differing = {tag: differences(config, other) for tag, other in known.items()}
     same = [tag for tag, changed in differing.items() if not changed]
@@ -131,62 +125,6 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
         device=_device(config["device"], chosen_algorithm.FAMILY),
         config=config,
     )
-
-
-def _composition(config: Plain, tasks: list[Env]) -> Composition:
-    """The groups' choices, as far as they make sense together."""
-    one_of("curriculum.name", config["curriculum"]["name"], list(CURRICULA))
-    curriculum = config["curriculum"]["name"] != "off"
-    boost, transfer = _boost(config["boosting"]), _transfer(config["transfer"])
-    if len(tasks) == 1 and (curriculum or boost or transfer):
-        key = "curriculum" if curriculum else "boosting" if boost else "transfer"
-        why = f"{config['env']['name']} has one task, so there is no stage to hand over"
-        raise ConfigError(
-            key,
-            config[key]["name"],
-            f"{why}; env.tasks needs at least two values",
-        )
-    if isinstance(transfer, (PolicyReuse, ResidualPolicy)) and not curriculum:
-        why = "needs an earlier task whose policy helps: curriculum=on"
-        raise ConfigError("transfer", config["transfer"]["name"], why)
-    if isinstance(transfer, ResidualPolicy) and boost:
-        why = (
-            "its Q is about its own actions, not the executed ones that a base is "
-            "about: boosting=off"
-        )
-        raise ConfigError("transfer", "residual_policy", why)
-    order = CURRICULA[config["curriculum"]["name"]](len(tasks))
-    return Composition(tuple(tasks), tuple(order), boost, transfer, config["scale"])
-
-
-def _boost(section: Plain) -> Boost | None:
-    values = _named("boosting", section, ["on", "off"])
-    if section["name"] == "off":
-        construct("boosting", Choice, section)
-        return None
-    boost = construct("boosting", Boost, values)
-    one_of("boosting.greedy_on", boost.greedy_on, ["sum", "residual"])
-    one_of("boosting.maxima", boost.maxima, ["one", "two"])
-    return boost
-
-
-def _transfer(section: Plain) -> Shape | PolicyReuse | ResidualPolicy | None:
-    values = _named("transfer", section, ["none", *TRANSFERS])
-    if section["name"] == "none":
-        construct("transfer", Choice, section)
-        return None
-    transfer = construct("transfer", TRANSFERS[section["name"]], values)
-    if isinstance(transfer, Shape):
-        one_of("transfer.next_state", transfer.next_state, ["stored", "before_reset"])
-    return transfer
-
-
-def _named(group: str, section: object, names: list[str]) -> Plain:
-    """A section's values besides its name, which must be one of `names`."""
-    if not isinstance(section, dict):
-        raise ConfigError(group, section, "must be a section with a name")
-    one_of(f"{group}.name", section.get("name"), names)
-    return {key: value for key, value in section.items() if key != "name"}
 
 
 def _variant(algorithm_name: str, chosen: Composition) -> str:

@@ -10,7 +10,8 @@ from torch.nn import functional
 
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.evaluation import evaluate
-from bcrl.learners.dqn import BLOCK, DQN, _Run
+from bcrl.learners.dqn import DQN
+from bcrl.learners.lockstep import BLOCK, Lockstep
 from bcrl.learners.lspi import LSPI
 from bcrl.policies import annealed
 from bcrl.q import Table
@@ -129,7 +130,7 @@ def test_epsilon_by_the_step():
 def test_epsilon_is_how_often_it_explores():
     """Actions in the replay: uniform while random, then almost all the greedy one."""
     settings = replace(TINY, random_steps=300, steps=300, learning_starts=10_000)
-    run = _Run(settings, staged(settings, TARGET), Start(), team(0))
+    run = Lockstep(settings, staged(settings, TARGET), Start(), team(0))
     best = []
     for step in range(600):
         best.append(int(run.deep(run.state[:, None], 8)[0, 0].argmax()))
@@ -199,7 +200,7 @@ def test_acting_and_evaluating_are_greedy_on_the_sum_or_on_the_residual(
     env, boost = Corridor(), Boost(greedy_on)
     settings = replace(TINY, random_steps=0, epsilon=0.0, learning_starts=1000)
     start = Start(base=known(best), boost=boost)
-    run = _Run(settings, staged(settings, env), start, team(0))
+    run = Lockstep(settings, staged(settings, env), start, team(0))
     every = env.states()[None]
     own = run.deep(every, 2)[0].argmax(1)
     expected = np.full(6, best) if greedy_on == "sum" else own
@@ -223,7 +224,7 @@ def test_different_seeds_start_from_different_weights_and_states():
     assert torch.equal(flat, moment.learned.residual.target.flat)
     later = next(learn(fresh, seeds=(0, 1, 2), number=2))
     assert not torch.equal(flat, weights(later))  # nor the same in the next stage
-    run = _Run(TINY, staged(TINY, TARGET), Start(), team(0, 1, 2))
+    run = Lockstep(TINY, staged(TINY, TARGET), Start(), team(0, 1, 2))
     assert len(np.unique(run.state[:, 2])) == 3
 
 
@@ -384,7 +385,7 @@ def test_the_recorded_loss_is_torchs_mean_since_the_last_moment(every):
     """Batches too: uniforms of the seed's own stream pick among what is held."""
     settings = replace(TINY, evaluate_every=every, replay_size=30)
     seeds, d, n = (4, 9), 4, 8
-    run = _Run(settings, staged(settings, TARGET), Start(), team(*seeds))
+    run = Lockstep(settings, staged(settings, TARGET), Start(), team(*seeds))
     picks = [stream(s, "replay", 1, 0).random((BLOCK, 32)) for s in seeds]
     losses, sides = [[], []], set()
     for step in range(settings.length):
@@ -415,7 +416,7 @@ def test_the_recorded_loss_is_torchs_mean_since_the_last_moment(every):
 def test_transitions_are_the_environments_and_discounts_its_gamma():
     settings = replace(TINY, random_steps=200, steps=1, learning_starts=1000)
     env = Corridor(horizon=7)
-    run = _Run(settings, staged(settings, env), Start(), team(0, 1))
+    run = Lockstep(settings, staged(settings, env), Start(), team(0, 1))
     for step in range(200):
         run.act(step)
     for s in range(2):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bcrl import runner
-from bcrl.errors import ConfigError
+from bcrl.errors import BcrlError, ConfigError
 from bcrl.records import is_complete, open_directory
 from bcrl.stage import Team, learn
 from tests.conftest import plan
@@ -202,7 +202,7 @@ def test_bad_input_is_refused(case):
     overrides, words = BAD[case]
     if case == "cuda without one" and torch.cuda.is_available():
         pytest.skip("there is a CUDA device")
-    with pytest.raises(ConfigError) as refusal:
+    with pytest.raises(BcrlError) as refusal:
         plan(*LINEAR, *overrides)
     assert words in str(refusal.value)
 

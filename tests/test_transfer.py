@@ -11,7 +11,8 @@ from bcrl.bellman import frozen_part, residual_target, shaping
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.errors import ConfigError
 from bcrl.evaluation import evaluate
-from bcrl.learners.dqn import BLOCK, CHOICES, DQN, _Run
+from bcrl.learners.dqn import DQN
+from bcrl.learners.lockstep import BLOCK, CHOICES, Lockstep
 from bcrl.learners.lspi import LSPI
 from bcrl.policies import combined
 from bcrl.q import ZERO, Raised, Sum, Table
@@ -108,7 +109,7 @@ def value(state):
 
 
 def run_of(start, settings=SMALL, env=TARGET, seeds=(0,), number=2):
-    return _Run(settings, staged(settings, env, number), start, team(*seeds))
+    return Lockstep(settings, staged(settings, env, number), start, team(*seeds))
 
 
 def put(run, state):

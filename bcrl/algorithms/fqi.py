@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from bcrl.algorithms import Composition, Plain, capped, placed
+from bcrl.composition import Composition, Plain, capped, placed
 from bcrl.config import construct, one_of, per_task
 from bcrl.envs import Env, is_finite
 from bcrl.errors import ConfigError

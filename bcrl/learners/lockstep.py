@@ -1,0 +1,236 @@
+"""A team of seeds in the middle of a DQN stage: acting, replay, updates, copies."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from bcrl.bellman import frozen_part, shaping
+from bcrl.learners.update import updater
+from bcrl.policies import combined, greedy, uniform
+from bcrl.q import Q, Raised, add
+from bcrl.q.mlp import Adam, DeepQ, Networks, xavier
+from bcrl.replay import Replay
+from bcrl.rollout import CHOICES, Policy
+from bcrl.stage import Moment, Stage, Team
+from bcrl.streams import stream
+from bcrl.transfer import Learned, PolicyReuse, ResidualPolicy, Start
+
+if TYPE_CHECKING:
+    from bcrl.learners.dqn import DQN
+
+BLOCK = 500  # steps whose uniforms are drawn at a time, from a stream of their own
+
+
+class Lockstep:
+    """S seeds, each with its environment, replay, networks and streams."""
+
+    def __init__(self, settings: DQN, stage: Stage, start: Start, team: Team) -> None:
+        self.settings, self.stage, self.start, self.team = settings, stage, start, team
+        self.env, n = stage.env, len(team.seeds)
+        self.deep = self._networks()
+        self.replay = Replay(
+            n,
+            settings.replay_size,
+            self.env.state_dim,
+            self.env.n_actions,
+            team.device,
+        )
+        self._gradient_step = updater(self.deep, self.replay)
+        self.frozen = {id(q): q for q in (start.base, start.potential, start.prior)}
+        self.table = (
+            combined(self.env.actions)
+            if isinstance(start.steering, ResidualPolicy)
+            else None
+        )
+        begin = np.stack(
+            [
+                stream(seed, "exploration", stage.number).random(self.env.initial_noise)
+                for seed in team.seeds
+            ]
+        )
+        self.state = self.env.initial(begin)  # (S, d)
+        self.known = self._frozen_values(self.state)
+        self.steps_in_episode = np.zeros(n, np.intp)
+        self.decisions = np.zeros(n, np.intp)  # that were not random, for RPL's offset
+        self.loss = np.zeros(n)  # summed over the updates since the last moment
+        self.updates = 0
+
+    def _networks(self) -> DeepQ:
+        """Those of the previous stage, or new ones with the target equal to online."""
+        if isinstance(self.start.initial, DeepQ):
+            return self.start.initial.clone()
+        sizes = (self.env.state_dim, *self.settings.hidden, self.env.n_actions)
+        drawn = [
+            xavier(stream(seed, "weights", self.stage.number), sizes)
+            for seed in self.team.seeds
+        ]
+        flat = torch.from_numpy(np.stack(drawn)).to(self.team.device)
+        online = Networks(sizes, flat)
+        optimiser = Adam(flat, self.settings.learning_rate)
+        return DeepQ(online, online.clone(), optimiser, 0)
+
+    def _frozen_values(self, state: NDArray) -> dict[int, NDArray]:
+        """Values (S, A) of base, potential and prior at states (S, d), by identity."""
+        asked = state[:, None]
+        return {
+            key: q(asked, self.env.n_actions)[:, 0] for key, q in self.frozen.items()
+        }
+
+    def act(self, step: int) -> None:
+        """One step of every seed's environment, into its replay."""
+        env, start = self.env, self.start
+        u = self._draws(step)
+        own_values = self._own_values(self.state[:, None], self.known[id(start.base)])
+        prior = self.known[id(start.prior)]
+        epsilon = self.settings.epsilon_at(step)
+        own, action = self._decide(own_values, prior, u, epsilon, step)
+        self.decisions += u[:, 0] >= epsilon
+        noise = u[:, CHOICES : CHOICES + env.step_noise]
+        after, reward, absorbing = env.step(self.state, action, noise)
+        known = self._frozen_values(after)
+        if start.shape is not None:
+            reward = reward + self._shaping(action, noise, after, absorbing, known)
+        base = np.take_along_axis(self.known[id(start.base)], own[:, None], -1)[:, 0]
+        fixed, discount, next_base = frozen_part(
+            reward,
+            absorbing,
+            known[id(start.base)],
+            base,
+            env.gamma,
+            start.boost.maxima,
+            start.boost.mask_at_goal,
+        )
+        self.replay.add(self.state, after, next_base, fixed, discount, own)
+        self.steps_in_episode += 1
+        over = absorbing | (self.steps_in_episode == env.horizon)
+        if over.any():
+            fresh = env.initial(u[:, CHOICES + env.step_noise :])
+            after = np.where(over[:, None], fresh, after)
+            self.steps_in_episode[over] = 0
+            known = self._frozen_values(after)
+        self.state, self.known = after, known
+
+    def _draws(self, step: int) -> NDArray[np.float64]:
+        """All uniforms of one step, (S, CHOICES + step_noise + initial_noise)."""
+        block, at = divmod(step, BLOCK)
+        if at == 0:
+            env, number = self.env, self.stage.number
+            shape = (BLOCK, CHOICES + env.step_noise + env.initial_noise)
+            batches = (BLOCK, self.settings.batch_size)
+            drawn, picked = [], []
+            for seed in self.team.seeds:
+                drawn.append(stream(seed, "exploration", number, block).random(shape))
+                picked.append(stream(seed, "replay", number, block).random(batches))
+            self._block = np.stack(drawn, 1)
+            self._places = self.replay.places(np.stack(picked, 1))
+        return self._block[at]
+
+    def _own_values(self, state: NDArray, base: NDArray) -> NDArray[np.float64]:
+        """What the own policy is greedy on, (S, E, A), at states (S, E, d)."""
+        values = self.deep(state, self.env.n_actions)
+        if self.start.boost.greedy_on == "sum":
+            values = values + base.reshape(values.shape)
+        return values.reshape(base.shape)
+
+    def _decide(
+        self,
+        own_values: NDArray,
+        prior_values: NDArray,
+        u: NDArray,
+        epsilon: NDArray | float,
+        step: int,
+        reuse: NDArray | bool = True,
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """The own action and the executed one, each (S, …), from values (S, …, A).
+
+        `reuse`: the lanes in which PPR may follow the prior.
+        """
+        random = u[..., 0] < epsilon
+        drawn = uniform(self.env.n_actions, u[..., 1])
+        own = np.where(random, drawn, greedy(own_values, u[..., 1]))
+        steering = self.start.steering
+        if isinstance(steering, PolicyReuse):
+            follow = reuse & (u[..., 2] < steering.nu**step)
+            own = np.where(follow, greedy(prior_values, u[..., 1]), own)
+        elif isinstance(steering, ResidualPolicy):
+            prior = greedy(prior_values, u[..., 2])
+            copying = self.decisions < steering.offset
+            copying = copying.reshape(-1, *[1] * (own.ndim - 1))
+            own = np.where(copying & ~random, prior, own)
+            return own, self.table[prior, own]
+        return own, own
+
+    def _shaping(
+        self,
+        action: NDArray,
+        noise: NDArray,
+        after: NDArray,
+        absorbing: NDArray,
+        known: dict[int, NDArray],
+    ) -> NDArray[np.float64]:
+        """What shaping adds to the rewards (S,)."""
+        key, shape = id(self.start.potential), self.start.shape
+        next_values = known[key]
+        if shape.next_state == "before_reset" and hasattr(self.env, "before_reset"):
+            left = self.env.before_reset(self.state, action, noise)
+            next_values = self._frozen_values(left)[key]
+        return shaping(
+            self.known[key].max(-1),
+            next_values.max(-1),
+            absorbing,
+            self.env.gamma,
+            shape.zero_at_goal,
+        )
+
+    def update(self, step: int) -> None:
+        """One gradient step of every seed on a batch of its own."""
+        self.loss += self._gradient_step(self._places[step % BLOCK])
+        self.updates += 1
+
+    def copy_target(self) -> None:
+        """Count a step; every `target_update` steps the target becomes the online."""
+        self.deep.steps += 1
+        if self.deep.steps % self.settings.target_update == 0:
+            self.deep.target.flat.copy_(self.deep.online.flat)
+
+    def moment(self, step: int) -> Moment:
+        """What there is to see after `step` steps of the stage."""
+        lost = ~torch.isfinite(self.deep.online.flat).all(1).cpu().numpy()
+        failed = {int(s): "non-finite weights" for s in np.flatnonzero(lost)}
+        for s in np.flatnonzero(~np.isfinite(self.loss)):
+            failed.setdefault(int(s), "non-finite loss")
+        loss = self.loss / self.updates if self.updates else self.loss + np.nan
+        self.loss, self.updates = np.zeros_like(loss), 0
+        q: Q = add(self.start.base, self.deep)
+        if self.start.shape is not None:
+            q = Raised(q, self.start.potential)
+        return Moment(
+            self.stage,
+            self.stage.before + step,
+            step == self.settings.length,
+            Learned(q, self.deep),
+            self._policy(step),
+            self.settings.evaluation_episodes,
+            loss,
+            failed,
+        )
+
+    def _policy(self, step: int) -> Policy:
+        """This moment's policy: half of the lanes explore, the others are greedy.
+
+        The greedy ones reuse nothing of the prior (PPR).
+        """
+        halves = np.repeat([1.0, 0.0], self.settings.evaluation_episodes)
+        epsilon, reuse = self.settings.evaluation_epsilon * halves, halves > 0
+
+        def policy(now: NDArray, u: NDArray, alive: NDArray) -> NDArray:
+            frozen = {k: q(now, self.env.n_actions) for k, q in self.frozen.items()}
+            own_values = self._own_values(now, frozen[id(self.start.base)])
+            prior = frozen[id(self.start.prior)]
+            return self._decide(own_values, prior, u, epsilon, step, reuse)[1]
+
+        return policy
