@@ -68,7 +68,11 @@ def composition(config: Plain, tasks: list[Env]) -> Composition:
             "about: boosting=off"
         )
         raise ConfigError("transfer", "residual_policy", why)
-    order = CURRICULA[config["curriculum"]["name"]](len(tasks))
+    name = config["curriculum"]["name"]
+    order = CURRICULA[name](len(tasks))
+    if len(order) != len(tasks):
+        why = f"has {len(order)} slots, budgets are lists with one entry a task"
+        raise ConfigError("curriculum", name, f"{why} ({len(tasks)})")
     return Composition(tuple(tasks), tuple(order), boost, transfer, config["scale"])
 
 

@@ -53,7 +53,8 @@ class Config:
     progress: str = "auto"
 
 
-#: Keys that don't belong to a configuration's identity: they change no number.
+#: Keys that don't belong to a configuration's identity: they change no number, but for
+#: another device's rounding.
 OUTPUT_KEYS = (
     *("seeds", "workers", "threads", "device"),
     *("runs_dir", "tag", "progress"),

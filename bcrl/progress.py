@@ -1,4 +1,4 @@
-"""How far a run is: a bar on a terminal, else a line a task."""
+"""How far a run is: a bar on a terminal, else a line now and then."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from tqdm import tqdm
+
+LINE_EVERY = 0.1  # share of a run between two lines, where no stage ends
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,7 @@ class Progress:
             mode = "bar" if sys.stderr.isatty() else "lines"
         self.name, self.length, self.unit, self.mode = name, length, unit, mode
         self.done, self.total = 0, len(seeds) * length
+        self._shown = 0.0
         self._counts: dict[tuple[int, ...], int] = {}
         self.began = time.monotonic()
         shape = "{desc} |{bar}| {percentage:3.0f}% {elapsed}, {remaining} to go"
@@ -51,12 +54,14 @@ class Progress:
         if self.bar is not None:
             self.bar.set_description_str(where, refresh=False)
             self.bar.update(new)
-        elif self.mode == "lines" and tick.last_of_stage and self.done:
-            spent = time.monotonic() - self.began
-            left = spent * (self.total - self.done) / self.done
+        elif self.mode == "lines" and new:
             share = self.done / self.total
-            line = f"{where} · {share:4.0%} · {spent:.0f} s, {left:.0f} s to go"
-            print(line, file=sys.stderr, flush=True)
+            if tick.last_of_stage or share >= self._shown + LINE_EVERY:
+                self._shown = share
+                spent = time.monotonic() - self.began
+                left = f", {spent / share - spent:.0f} s to go" * (share >= LINE_EVERY)
+                line = f"{where} · {share:4.0%} · {spent:.0f} s{left}"
+                print(line, file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Leave the terminal tidy."""

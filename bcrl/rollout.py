@@ -103,12 +103,15 @@ def play(
             shape = (n_seeds, n_episodes, horizon, *act.shape[2:])
             action = np.zeros(shape, act.dtype)
             step = env.push if act.dtype == np.float64 else env.step
-        length[alive] += 1
+        # Boolean masks copy; as long as all lanes live there is no need of one.
+        lanes = (slice(None), slice(None)) if alive.all() else (alive,)
+        length[lanes] += 1
         action[:, :, t] = act
-        after, r, done = step(now[alive], act[alive], u[:, t, :, noise:][alive])
+        after, r, done = step(now[lanes], act[lanes], u[:, t, :, noise:][lanes])
         state[:, :, t + 1] = now
-        state[alive, t + 1], reward[alive, t], absorbing[alive, t] = after, r, done
-        alive[alive] = ~done
+        state[(*lanes, t + 1)] = after
+        reward[(*lanes, t)], absorbing[(*lanes, t)] = r, done
+        alive[lanes] = ~done
         if not alive.any():
             break
     return Episodes(state, action, reward, absorbing, length)

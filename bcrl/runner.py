@@ -136,6 +136,7 @@ def train_group(
         "wall_seconds": time.perf_counter() - wall,
         "cpu_seconds": (time.process_time() - cpu) / len(seeds),  # this seed's share
         "lockstep": list(seeds),
+        "device": plan.device,
         "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
     for s, seed in enumerate(seeds):

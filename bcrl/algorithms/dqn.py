@@ -21,6 +21,16 @@ LEARNERS = ("auto", "dqn", "lspi")
 
 
 @dataclass(frozen=True)
+class LSPISettings:
+    """The section `lspi`."""
+
+    iterations: int
+    noise_std: float
+    features: str
+    drop_last: bool
+
+
+@dataclass(frozen=True)
 class Settings:
     """`conf/algorithm/dqn.yaml`; where Any, one value or a list with one a task."""
 
@@ -127,6 +137,7 @@ def _check(settings: Settings) -> None:
         raise ConfigError(
             "algorithm.learning_rate", settings.learning_rate, "must be above 0"
         )
+    _lspi_settings(settings)
     widths = settings.hidden
     if not widths or not all(type(w) is int and w >= 1 for w in widths):
         why = "must be a list of layer widths, each at least 1"
@@ -144,18 +155,28 @@ def _lspi(settings: Settings, env: Env, own: dict[str, Any], warm: bool) -> LSPI
     if warm:
         why = "leaves no network to start DQN's from: boosting=on or a transfer needed"
         raise ConfigError("algorithm.learners", "lspi", why)
-    values = dict(settings.lspi)
-    iterations, steps = values.get("iterations"), own["steps"]
-    at_least("algorithm.lspi.iterations", iterations, 1)
-    episodes, rest = divmod(steps, iterations * env.horizon)
+    chosen, steps = _lspi_settings(settings), own["steps"]
+    episodes, rest = divmod(steps, chosen.iterations * env.horizon)
     if rest or not episodes:
-        why = f"LSPI needs a multiple of {iterations} iterations x {env.horizon} steps"
-        raise ConfigError("algorithm.steps", steps, why)
-    values |= {"horizon": env.horizon, "episodes": episodes}
-    values["evaluation_episodes"] = own["evaluation_episodes"]
-    learner = construct("algorithm.lspi", LSPI, values)
-    one_of("algorithm.lspi.features", learner.features, FEATURES)
-    if learner.noise_std <= 0:
+        why = f"LSPI needs a multiple of {chosen.iterations} iterations x {env.horizon}"
+        raise ConfigError("algorithm.steps", steps, f"{why} steps")
+    return LSPI(
+        chosen.iterations,
+        episodes,
+        float(chosen.noise_std),
+        chosen.features,
+        chosen.drop_last,
+        own["evaluation_episodes"],
+        env.horizon,
+    )
+
+
+def _lspi_settings(settings: Settings) -> LSPISettings:
+    """The section `lspi`, checked whether a stage needs it or not."""
+    chosen = construct("algorithm.lspi", LSPISettings, settings.lspi)
+    at_least("algorithm.lspi.iterations", chosen.iterations, 1)
+    one_of("algorithm.lspi.features", chosen.features, FEATURES)
+    if chosen.noise_std <= 0:
         why = "must be above 0: without noise LSTDQ sees one action a state"
-        raise ConfigError("algorithm.lspi.noise_std", learner.noise_std, why)
-    return learner
+        raise ConfigError("algorithm.lspi.noise_std", chosen.noise_std, why)
+    return chosen

@@ -70,8 +70,10 @@ def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
 def _check_transfers(chosen: Composition) -> None:
     """Raise ConfigError for what has no meaning in fitted iteration."""
     if isinstance(chosen.transfer, (PolicyReuse, ResidualPolicy)):
-        why = "steers a learner step by step, FQI learns from whole episodes"
-        raise ConfigError("transfer", "policy_reuse or residual_policy", why)
+        why = "steers step by step, FQI learns from whole episodes; use algorithm=dqn"
+        reuse = isinstance(chosen.transfer, PolicyReuse)
+        name = "policy_reuse" if reuse else "residual_policy"
+        raise ConfigError("transfer", name, why)
     if chosen.boost not in (None, Boost()):
         why = "is the released DQN's reading; the released FQI boosts as boosting=on"
         raise ConfigError("boosting", "released", why)

@@ -25,7 +25,6 @@ ACTIONS = np.array(
     [[1, 0], [0, 1], [-1, 0], [0, -1]]
     + [[a * DIAGONAL, b * DIAGONAL] for a in (1, -1) for b in (1, -1)]
 )
-VELOCITIES, POSITIONS = (1, 3), (0, 2)
 
 
 class Constants(NamedTuple):
@@ -59,7 +58,7 @@ class LinearSystem:
     | actions | unit forces: 0–3 +x, +y, −x, −y; 4–7 (+,+), (+,−), (−,+), (−,−) |
     | dynamics | x' = ẋ, ẋ' = −friction ẋ + gain F_x, same for y; noise N(0, 1e-5²) on each derivative; Euler steps of 0.05 s |
     | `task=lq` | reward −s'ᵀ diag(3, 1, 3, 1) s' − 0.1 ‖F‖²; horizon 100; never absorbing |
-    | `task=target` | `drift` is added to x'; walls at x = −5 and x = 1 reflect; whoever ends a step with \\|y\\| > 0.5 is put back to a fresh start (not absorbing); reward 0 and absorbing if ‖(x, y)‖ < 0.2, else −1; horizon 150 |
+    | `task=target` | `drift` is added to x'; walls at x = −5 and x = 1 reflect; (the drift may leave x outside by 0.02, where ẋ changes sign each step); whoever ends a step with \\|y\\| > 0.5 is put back to a fresh start (not absorbing); reward 0 and absorbing if ‖(x, y)‖ < 0.2, else −1; horizon 150 |
     | start | (−4, 0, 0, 0) plus a uniform draw from a box, see PRESETS |
     | source | Klink et al. (2022), §6.3 and C.3; released code for dt, walls, γ, horizons |
 
@@ -139,7 +138,10 @@ class LinearSystem:
             cost = cost + ACTION_COST * (force**2).sum(-1)
             return moved, -cost, xp.zeros_like(cost, dtype=bool)
         fell = abs(moved[..., 2]) > PATHWAY
-        after = xp.where(fell[..., None], self.initial(noise[..., 4:]), moved)
+        after = moved
+        if fell.any():
+            fresh = self.initial(noise[..., 4:])
+            after = xp.where(fell[..., None], fresh, moved)
         arrived = after[..., 0] ** 2 + after[..., 2] ** 2 < GOAL_RADIUS**2
         return after, xp.where(arrived, 0.0, -1.0), arrived
 
@@ -159,15 +161,18 @@ class LinearSystem:
         noise: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         """Integrate and, in the target task, reflect."""
-        gain, _, _ = self.constants
-        xp = namespace(state)
-        free = self._derivative(state)
-        pushed = xp.zeros_like(state)
-        pushed[..., VELOCITIES[0]] = gain * force[..., 0]
-        pushed[..., VELOCITIES[1]] = gain * force[..., 1]
-        if self.task == "target":
-            pushed[..., 0] = self.drift
-        moved = state + DT * (free + pushed + NOISE * ndtri(noise[..., :4]))
+        gain, friction, _ = self.constants
+        xp, drift = namespace(state), self.drift if self.task == "target" else 0.0
+        x_dot, y_dot = state[..., 1], state[..., 3]
+        pushed = gain * force
+        rate = [
+            x_dot + drift,
+            pushed[..., 0] - friction * x_dot,
+            y_dot,
+            pushed[..., 1] - friction * y_dot,
+        ]
+        noise = NOISE * ndtri(noise[..., :4])
+        moved = state + DT * (xp.stack(rate, -1) + noise)
         if self.task == "lq":
             return moved
         low, high = WALLS
@@ -183,19 +188,23 @@ class LinearSystem:
         share = xp.where(beyond, share, 1.0)[..., None]
         contact = state + share * (moved - state)
         contact[..., 1] = -contact[..., 1]
-        onward = contact + (1.0 - share) * DT * self._derivative(contact)
+        onward = contact + (1.0 - share) * DT * self._coasting(contact)
         return xp.where(beyond[..., None], onward, moved)
 
-    def _derivative(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _coasting(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
         """The derivative without force, drift and noise, (..., 4)."""
         xp, friction = namespace(state), self.constants.friction
         x_dot, y_dot = state[..., 1], state[..., 3]
         return xp.stack([x_dot, -friction * x_dot, y_dot, -friction * y_dot], -1)
 
     def evaluation_states(self) -> NDArray[np.float64]:
-        """The start box's centre and the corners of the box half as wide, (17, 4)."""
-        corners = np.stack(np.meshgrid(*[[0.25, 0.75]] * 4, indexing="ij"), -1)
-        return self.initial(np.vstack([np.full((1, 4), 0.5), corners.reshape(-1, 4)]))
+        """(−4, 0, 0, 0) and the corners of half the target's start box, (17, 4).
+
+        The same in both tasks, so that FQI's curves go on from one to the other.
+        """
+        half = 0.5 * np.array(PRESETS["released"]["target"].spread)
+        signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 4, indexing="ij"), -1)
+        return START + half * np.vstack([np.zeros((1, 4)), signs.reshape(-1, 4)])
 
     def plane(self, side: int = 41, extent: float = 5.0) -> NDArray[np.float64]:
         """The x–y plane [−extent, extent]² at zero velocity, x-major, (side², 4)."""

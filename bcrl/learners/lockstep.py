@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bcrl.bellman import frozen_part, shaping
 from bcrl.learners.update import updater
 from bcrl.policies import combined, greedy, uniform
-from bcrl.q import Q, Raised, add
+from bcrl.q import Q, Shaped, add
 from bcrl.q.mlp import Adam, DeepQ, Networks, xavier
 from bcrl.replay import Replay
 from bcrl.rollout import CHOICES, Policy
@@ -207,7 +207,7 @@ class Lockstep:
         self.loss, self.updates = np.zeros_like(loss), 0
         q: Q = add(self.start.base, self.deep)
         if self.start.shape is not None:
-            q = Raised(q, self.start.potential)
+            q = Shaped(self.start.base, self.deep, self.start.potential)
         return Moment(
             self.stage,
             self.stage.before + step,
@@ -228,7 +228,8 @@ class Lockstep:
         epsilon, reuse = self.settings.evaluation_epsilon * halves, halves > 0
 
         def policy(now: NDArray, u: NDArray, alive: NDArray) -> NDArray:
-            frozen = {k: q(now, self.env.n_actions) for k, q in self.frozen.items()}
+            asked = {id(q): q for q in (self.start.base, self.start.prior)}
+            frozen = {key: q(now, self.env.n_actions) for key, q in asked.items()}
             own_values = self._own_values(now, frozen[id(self.start.base)])
             prior = frozen[id(self.start.prior)]
             return self._decide(own_values, prior, u, epsilon, step, reuse)[1]

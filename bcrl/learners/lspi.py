@@ -25,7 +25,7 @@ class LSPI:
     Each iteration collects `episodes` with the current gain, solves LSTDQ on them alone
     and sets K ← −Quu⁻¹ Qus. `features`: see `bcrl.q.quadratic`. `drop_last` leaves each
     episode's last step out [released]. A gain that is not finite, or pushes away from
-    the goal (K[0, 0] or K[1, 2] above 0), ends its seed.
+    the goal (K[0, 0] or K[1, 2] above 0), fails its seed.
     """
 
     iterations: int = 4
@@ -34,7 +34,7 @@ class LSPI:
     features: str = "products"
     drop_last: bool = True
     evaluation_episodes: int = 50
-    horizon: int = 100  # the env's
+    horizon: int = 100  # of the task
 
     name: ClassVar[str] = "lspi"
 

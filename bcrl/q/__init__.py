@@ -57,16 +57,21 @@ class Sum:
 
 
 @dataclass(frozen=True)
-class Raised:
-    """Q(s, a) + max_a' potential(s, a'): undoes what shaping with it took off."""
+class Shaped:
+    """base + ϱ + max_a' potential(s, a'): undoes what shaping took off the rewards.
 
-    q: Q
+    A base that is the potential, too, is asked once: stages may be stacked on stages.
+    """
+
+    base: Q
+    residual: Q
     potential: Q
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        values = self.q(states, n_actions)
-        lift = self.potential(states, n_actions)
-        return each(states, lambda s: values[s] + lift[s].max(-1, keepdims=True))
+        base, own = self.base(states, n_actions), self.residual(states, n_actions)
+        same = self.potential is self.base
+        lift = base if same else self.potential(states, n_actions)
+        return each(states, lambda s: base[s] + own[s] + lift[s].max(-1, keepdims=True))
 
 
 def add(base: Q, residual: Q) -> Q:

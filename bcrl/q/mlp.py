@@ -137,6 +137,8 @@ class Adam:
         first, second = self.moments
         first.lerp_(gradient, 1.0 - b1)
         second.mul_(b2).addcmul_(gradient, gradient, value=1.0 - b2)
+        first.masked_fill_(first.abs() < fused.FADED, 0.0)
+        second.masked_fill_(second < fused.FADED, 0.0)
         parameters.addcdiv_(first, second.sqrt().mul_(scale).add_(eps), value=-rate)
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.q import Values, each
+from bcrl.q import Values
 
 #: products: all z_i z_j, i ≤ j [released]; linear_quadratic: the z_i besides [paper].
 FEATURES = ("products", "linear_quadratic")
@@ -42,20 +43,21 @@ class Quadratic:
         matrix[:, i, j] = products / 2.0
         return cls(matrix + matrix.transpose(0, 2, 1), linear, actions)
 
-    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        if isinstance(states, np.ndarray):
-            return self._values(states, self.matrix, self.linear)
-        return each(
-            states,
-            lambda s: self._values(states[s], self.matrix[s], self.linear[s]),
-        )
+    @cached_property
+    def _parts(self) -> tuple[NDArray, NDArray, NDArray]:
+        """Values are xᵀ P x + x·C + c: P (S, d, d), C (S, d, A), c (S, A)."""
+        act = self.actions
+        d = self.matrix.shape[-1] - act.shape[1]
+        cross = 2.0 * self.matrix[:, :d, d:] @ act.T + self.linear[:, :d, None]
+        alone = (act @ self.matrix[:, d:, d:] * act).sum(-1)
+        return self.matrix[:, :d, :d], cross, alone + self.linear[:, d:] @ act.T
 
-    def _values(self, x: NDArray, matrix: NDArray, linear: NDArray) -> NDArray:
-        """Values (..., n, A) at states x (..., n, d) of matrices (..., m, m)."""
-        d, act = x.shape[-1], self.actions
-        of_state, cross = matrix[..., :d, :d], matrix[..., :d, d:]
-        square = (x * (x @ of_state + linear[..., None, :d])).sum(-1, keepdims=True)
-        mixed = 2.0 * (x @ (cross @ act.T))
-        alone = (act @ matrix[..., d:, d:] * act).sum(-1)
-        alone = alone + (act * linear[..., None, d:]).sum(-1)
-        return square + mixed + alone[..., None, :]
+    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        pure, cross, alone = self._parts
+        if isinstance(states, np.ndarray):
+            square = (states @ pure * states).sum(-1, keepdims=True)
+            return states @ cross + alone[:, None] + square
+        return [
+            x @ cross[s] + alone[s] + (x @ pure[s] * x).sum(-1, keepdims=True)
+            for s, x in enumerate(states)
+        ]
