@@ -3,13 +3,14 @@
 Computes what `bcrl.q.mlp` and `DQN`'s torch update compute with batched products, but
 one seed's parameters stay in the cache from the batch to Adam, and no cost is paid by
 the call. A seed's floats don't depend on the others nor on the number of threads.
-Matrix products are BLAS's, kept to one thread by the caller.
+Matrix products are SciPy's BLAS's, loaded here and kept to one thread by the caller.
 """
 
 from __future__ import annotations
 
 import numba
 import numpy as np
+import scipy.linalg.cython_blas  # noqa: F401, limits reach only what is loaded
 
 FADED = np.float32(1e-30)
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -57,7 +58,7 @@ def outputs(flat, sizes, x):
 def backward(flat, sizes, x, work, slope, gradient, spare):
     """One seed's gradients into `gradient` (P,), from ∂loss/∂output `slope` (n, out).
 
-    `work` holds the activations of `forward`, `spare` (3, n · widest) is overwritten.
+    `work` holds the activations of `forward`, `spare` (2, n · widest) is overwritten.
     """
     n, last = x.shape[0], len(sizes) - 2
     at, to = len(flat), n * sizes[1:].sum()
@@ -79,12 +80,11 @@ def backward(flat, sizes, x, work, slope, gradient, spare):
         np.dot(before.T, slope, change)
         if layer:
             onward = spare[layer % 2, : n * n_in].reshape(n, n_in)
-            turned = spare[2, : n * n_in].reshape(n_in, n)
-            np.dot(weights, slope.T, turned)  # faster than slope · weightsᵀ
+            np.dot(slope, weights.T, onward)
             for row in range(n):
                 for k in range(n_in):
                     on = before[row, k] > 0
-                    onward[row, k] = turned[k, row] if on else np.float32(0.0)
+                    onward[row, k] = onward[row, k] if on else np.float32(0.0)
             slope = onward
 
 
@@ -121,7 +121,7 @@ def update(online, target, moments, sizes, rows, places, layout, constants, loss
     n_seeds, n = places.shape
     total, widest = sizes[1:].sum(), sizes.max()
     work = np.empty(n * total, np.float32)
-    spare = np.empty((3, n * widest), np.float32)
+    spare = np.empty((2, n * widest), np.float32)
     gradient = np.empty(online.shape[1], np.float32)
     x, after = np.empty((n, d), np.float32), np.empty((n, d), np.float32)
     y, one = np.empty(n, np.float32), np.float32(1.0)
