@@ -38,6 +38,8 @@ class Replay:
         width = 2 * d + n_actions + 3
         self.rows = torch.zeros((n_seeds, capacity, width), device=device)
         self.added = 0
+        on_cpu = self.rows.device.type == "cpu"
+        self._shared = self.rows.numpy() if on_cpu else None  # the same memory
         self._row = np.empty((n_seeds, width), np.float32)
         self._first = torch.arange(n_seeds, device=device)[:, None] * capacity
 
@@ -63,7 +65,11 @@ class Replay:
             next_base,
         )
         row[:, end], row[:, end + 1], row[:, end + 2] = fixed, discount, action
-        self.rows[:, self.added % self.capacity] = torch.from_numpy(row)
+        at = self.added % self.capacity
+        if self._shared is not None:
+            self._shared[:, at] = row
+        else:
+            self.rows[:, at] = torch.from_numpy(row)
         self.added += 1
 
     def places(self, u: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -67,6 +67,14 @@ def places(seeds, steps, n=200):
     return np.stack(picked, 1)
 
 
+NEXT = np.random.default_rng(1).standard_normal((8, D))
+
+
+def losses_of(update, chosen):
+    """One update's losses; what it says of the next states is checked elsewhere."""
+    return update(chosen, NEXT[: len(chosen)])[0]
+
+
 def module(networks, s):
     """Seed s's network as torch's own."""
     layers = []
@@ -107,7 +115,7 @@ def test_gradients_and_adam_are_torchs(way, hidden):
     ]
     update = way(deep, replay)
     for step in range(steps):
-        losses = update(at[step])
+        losses = losses_of(update, at[step])
         for s, (one, target) in enumerate(single):
             loss = loss_of(one, target, replay.rows[s, at[step, s]])
             adams[s].zero_grad()
@@ -147,7 +155,7 @@ def test_both_ways_agree_over_fifty_steps(hidden):
     ways = batched(one, replay), compiled(other, replay)
     began = one.online.flat.clone()
     for step in range(50):
-        losses = [way(at[step]) for way in ways]
+        losses = [losses_of(way, at[step]) for way in ways]
         assert np.allclose(*losses, rtol=1e-3)
     assert (one.online.flat - began).abs().mean() > 1e-3
     assert (one.online.flat - other.online.flat).abs().max() < 1e-4
@@ -160,22 +168,31 @@ def test_stacking_changes_no_bit(way, hidden):
     seeds, steps = (3, 4, 5, 6, 7), 20
     many, replay, at = learner(hidden, seeds), filled(seeds), places(seeds, steps)
     update = way(many, replay)
-    losses = np.array([update(at[step]) for step in range(steps)])
+    losses = np.array([losses_of(update, at[step]) for step in range(steps)])
     for s in (0, 3):
         alone = learner(hidden, seeds[s : s + 1])
         update = way(alone, filled(seeds[s : s + 1]))
-        own = np.array([update(at[step, s : s + 1]) for step in range(steps)])
+        own = np.array(
+            [losses_of(update, at[step, s : s + 1]) for step in range(steps)]
+        )
         assert np.array_equal(own[:, 0], losses[:, s])
         assert torch.equal(alone.online.flat[0], many.online.flat[s])
         moments = alone.optimiser.moments[:, 0], many.optimiser.moments[:, s]
         assert torch.equal(*moments)
 
 
+@HIDDEN
+def test_the_compiled_update_looks_ahead_with_the_new_parameters(hidden):
+    deep, replay, at = learner(hidden, (0, 1)), filled((0, 1)), places((0, 1), 1)
+    _, ahead = compiled(deep, replay)(at[0], NEXT[:2])
+    assert np.array_equal(ahead, deep(NEXT[:2, None], A)[:, 0])
+
+
 def test_on_a_cpu_the_update_is_compiled(monkeypatch):
     deep, replay = learner((16,), (0,)), filled((0,))
     called = []
-    monkeypatch.setattr(fused, "update", lambda *args: called.append(len(args)))
-    updater(deep, replay)(places((0,), 1)[0])
+    monkeypatch.setattr(fused, "update", lambda *given: called.append(len(given)))
+    losses_of(updater(deep, replay), places((0,), 1)[0])
     assert called
 
 
@@ -206,7 +223,7 @@ def test_gradients_do_not_leak_where_the_unit_is_off():
     deep.online.layers[0][1][:] = -1.0
     for way in (batched, compiled):
         copy = deep.clone()
-        way(copy, replay)(places((0,), 1)[0])
+        losses_of(way(copy, replay), places((0,), 1)[0])
         (w1, b1), (w2, b2) = Networks(
             deep.online.sizes, copy.optimiser.moments[0]
         ).layers
@@ -250,13 +267,13 @@ def test_a_deep_q_answers_stacked_and_listed_states_alike():
 
 def test_a_clone_trains_on_its_own():
     deep, replay = learner((16,), (0, 1)), filled((0, 1))
-    compiled(deep, replay)(places((0, 1), 1)[0])
+    losses_of(compiled(deep, replay), places((0, 1), 1)[0])
     deep.steps = 7
     copy = deep.clone()
     kept = deepcopy((deep.online.flat, deep.target.flat, deep.optimiser.moments))
     assert (copy.steps, copy.optimiser.steps) == (7, 1)
     assert torch.equal(copy.optimiser.moments, kept[2])
-    compiled(copy, replay)(places((0, 1), 1)[0])
+    losses_of(compiled(copy, replay), places((0, 1), 1)[0])
     copy.target.flat.zero_()
     now = deep.online.flat, deep.target.flat, deep.optimiser.moments
     assert all(torch.equal(a, b) for a, b in zip(now, kept, strict=True))

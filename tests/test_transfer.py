@@ -15,7 +15,7 @@ from bcrl.learners.dqn import DQN
 from bcrl.learners.lockstep import BLOCK, CHOICES, Lockstep
 from bcrl.learners.lspi import LSPI
 from bcrl.policies import combined
-from bcrl.q import ZERO, Raised, Sum, Table
+from bcrl.q import ZERO, Shaped, Sum, Table
 from bcrl.rollout import transition_tables
 from bcrl.streams import stream
 from bcrl.transfer import (
@@ -467,7 +467,7 @@ def test_shaping_shifts_q_by_minus_v_and_keeps_the_greedy_policy(seed):
     assert np.allclose(shaped, plain - v[:, None], atol=1e-9)
     assert np.array_equal(shaped.argmax(1), plain.argmax(1))
     tables = (Table([t], env.index) for t in (shaped, np.repeat(v[:, None], 2, 1)))
-    assert np.allclose(Raised(*tables)([env.states()], 2)[0], plain, atol=1e-9)
+    assert np.allclose(Shaped(ZERO, *tables)([env.states()], 2)[0], plain, atol=1e-9)
 
 
 def test_shaping_that_is_not_zero_at_the_goal_may_change_the_policy():
@@ -491,3 +491,22 @@ def test_lspis_q_is_a_prior():
     run.act(0)
     done = int(stored(run)["action"])
     assert TARGET.actions[done].tolist() == [1.0, 0.0]
+
+
+class Counting:
+    """A Q-function that counts how often it is asked."""
+
+    def __init__(self):
+        self.asked = 0
+
+    def __call__(self, states, n_actions):
+        self.asked += 1
+        return [np.ones((len(x), n_actions)) for x in states]
+
+
+def test_stages_stacked_with_shaping_and_boosting_are_asked_once_each():
+    first, states = Counting(), [np.zeros((3, 1))]
+    q = first
+    for _ in range(10):
+        q = Shaped(q, ZERO, q)
+    assert (q(states, 2)[0] == 2.0**10).all() and first.asked == 1

@@ -40,6 +40,7 @@ class Lockstep:
             team.device,
         )
         self._gradient_step = updater(self.deep, self.replay)
+        self._ahead: NDArray | None = None  # ϱ's values at the state, if known
         self.frozen = {id(q): q for q in (start.base, start.potential, start.prior)}
         self.table = (
             combined(self.env.actions)
@@ -84,7 +85,10 @@ class Lockstep:
         """One step of every seed's environment, into its replay."""
         env, start = self.env, self.start
         u = self._draws(step)
-        own_values = self._own_values(self.state[:, None], self.known[id(start.base)])
+        values = self._ahead
+        if values is None:
+            values = self.deep(self.state[:, None], env.n_actions)[:, 0]
+        own_values = self._whole(values, self.known[id(start.base)])
         prior = self.known[id(start.prior)]
         epsilon = self.settings.epsilon_at(step)
         own, action = self._decide(own_values, prior, u, epsilon, step)
@@ -129,12 +133,9 @@ class Lockstep:
             self._places = self.replay.places(np.stack(picked, 1))
         return self._block[at]
 
-    def _own_values(self, state: NDArray, base: NDArray) -> NDArray[np.float64]:
-        """What the own policy is greedy on, (S, E, A), at states (S, E, d)."""
-        values = self.deep(state, self.env.n_actions)
-        if self.start.boost.greedy_on == "sum":
-            values = values + base.reshape(values.shape)
-        return values.reshape(base.shape)
+    def _whole(self, values: NDArray, base: NDArray) -> NDArray[np.float64]:
+        """What the own policy is greedy on, from ϱ's values and base (S, …, A)."""
+        return values + base if self.start.boost.greedy_on == "sum" else values
 
     def _decide(
         self,
@@ -188,7 +189,9 @@ class Lockstep:
 
     def update(self, step: int) -> None:
         """One gradient step of every seed on a batch of its own."""
-        self.loss += self._gradient_step(self._places[step % BLOCK])
+        places = self._places[step % BLOCK]
+        loss, self._ahead = self._gradient_step(places, self.state)
+        self.loss += loss
         self.updates += 1
 
     def copy_target(self) -> None:
@@ -230,7 +233,8 @@ class Lockstep:
         def policy(now: NDArray, u: NDArray, alive: NDArray) -> NDArray:
             asked = {id(q): q for q in (self.start.base, self.start.prior)}
             frozen = {key: q(now, self.env.n_actions) for key, q in asked.items()}
-            own_values = self._own_values(now, frozen[id(self.start.base)])
+            own_values = self.deep(now, self.env.n_actions)
+            own_values = self._whole(own_values, frozen[id(self.start.base)])
             prior = frozen[id(self.start.prior)]
             return self._decide(own_values, prior, u, epsilon, step, reuse)[1]
 

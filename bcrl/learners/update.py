@@ -12,14 +12,19 @@ from bcrl.q import fused
 from bcrl.q.mlp import DeepQ, Networks
 from bcrl.replay import Replay
 
-Update = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+#: (places (S, B), next states (S, d)) → losses (S,), and the network's values (S, A) at
+#: these states if they were cheap to have
+Update = Callable[
+    [NDArray[np.int64], NDArray[np.float64]],
+    tuple[NDArray[np.float64], NDArray[np.float32] | None],
+]
 
 
 def updater(deep: DeepQ, replay: Replay) -> Update:
-    """The function that makes one step from the batches at `places` (S, B).
+    """The function that makes one gradient step from the batches at `places`.
 
-    It returns each seed's mean smooth-L1 loss (S,). Both ways compute the same
-    (tests/test_dqn.py), and no seed's result depends on the others.
+    Losses are means over a batch of smooth-L1. Both ways compute the same
+    (tests/test_mlp.py), and no seed's result depends on the others.
     """
     if deep.online.flat.device.type == "cpu":
         return compiled(deep, replay)
@@ -31,7 +36,7 @@ def batched(deep: DeepQ, replay: Replay) -> Update:
     online, target = deep.online, deep.target
     gradient = Networks(online.sizes, torch.zeros_like(online.flat))
 
-    def update(places: NDArray[np.int64]) -> NDArray[np.float64]:
+    def update(places: NDArray, states: NDArray) -> tuple[NDArray, None]:
         batch = replay.sample(torch.from_numpy(places).to(online.flat.device))
         next_values = target.forward(batch.next_state).add_(batch.next_base)
         y = torch.addcmul(batch.fixed, batch.discount, next_values.amax(-1))
@@ -43,7 +48,7 @@ def batched(deep: DeepQ, replay: Replay) -> Update:
         slope.scatter_(-1, batch.action, (clipped / error.shape[1])[..., None])
         online.backward(batch.state, slope, gradient)
         deep.optimiser.step(online.flat, gradient.flat)
-        return (clipped * (error - 0.5 * clipped)).mean(1).cpu().numpy()
+        return (clipped * (error - 0.5 * clipped)).mean(1).cpu().numpy(), None
 
     return update
 
@@ -55,9 +60,22 @@ def compiled(deep: DeepQ, replay: Replay) -> Update:
     sizes, layout = np.array(deep.online.sizes), (replay.d, replay.n_actions)
     rows = replay.rows.numpy()
 
-    def update(places: NDArray[np.int64]) -> NDArray[np.float64]:
-        adam, loss = deep.optimiser.next_step(), np.zeros(len(online))
-        fused.update(online, target, moments, sizes, rows, places, layout, adam, loss)
-        return loss
+    def update(places: NDArray, states: NDArray) -> tuple[NDArray, NDArray]:
+        adam, loss = deep.optimiser.next_step(), np.empty(len(online))
+        ahead = np.empty((len(online), replay.n_actions), np.float32)
+        fused.update(
+            online,
+            target,
+            moments,
+            sizes,
+            rows,
+            places,
+            layout,
+            adam,
+            states.astype(np.float32),
+            loss,
+            ahead,
+        )
+        return loss, ahead
 
     return update

@@ -110,11 +110,15 @@ def adam(parameters, gradient, first, second, beta1, beta2, rate, scale, eps):
 
 
 @_compiled
-def update(online, target, moments, sizes, rows, places, layout, constants, loss):
-    """One DQN update of S seeds, in place; adds each one's mean loss to `loss` (S,).
+def update(
+    online, target, moments, sizes, rows, places, layout, constants, states, loss, ahead
+):
+    """One DQN update of S seeds, in place; each one's mean loss goes to `loss` (S,).
 
     online, target (S, P); moments (2, S, P); rows (S, capacity, width) packed by
     `Replay`; places (S, B) rows of each seed's own; layout: d and A; constants: Adam's.
+    While its parameters are in the cache, each network is asked at the state that comes
+    next, states (S, d): `ahead` (S, A).
     """
     d, n_actions = layout
     beta1, beta2, rate, scale, eps = constants
@@ -148,7 +152,8 @@ def update(online, target, moments, sizes, rows, places, layout, constants, loss
             clipped = one if error > one else -one if error < -one else error  # or nan
             slope[b, a] = clipped / np.float32(n)
             total_loss += clipped * (error - np.float32(0.5) * clipped)
-        loss[s] += total_loss / n
+        loss[s] = total_loss / n
         backward(online[s], sizes, x, work, slope, gradient, spare)
         first, second = moments[0, s], moments[1, s]
         adam(online[s], gradient, first, second, beta1, beta2, rate, scale, eps)
+        ahead[s] = forward(online[s], sizes, states[s : s + 1], work)[0]
