@@ -114,14 +114,13 @@ def plan(
         if choices.get(group) is None:
             raise BcrlError(f"{group}: every run needs a choice of it")
     extra = tuple(f for f in folders if Path(f) != CONF)
-    known = {}
+    config, known = _plain(composed), {}
     for tag, released in ((None, False), (RELEASED, True)):
-        variant = (
-            f"env={choices['env']}",
-            *_usual(_plain(composed), choices, released),
-        )
+        variant = (f"env={choices['env']}", *_usual(config, choices, released))
         known[tag] = _plain(_compose(CONFIG_NAME, variant, extra))
-    return compose.plan(_plain(composed), known, choices["env"])
+        if not compose.differences(config, known[tag]):
+            break
+    return compose.plan(config, known, choices["env"])
 
 
 def _usual(config: Plain, choices: Mapping[str, str], released: bool) -> Iterator[str]:
