@@ -48,8 +48,9 @@ class Composition:
 
 def composition(config: Plain, tasks: list[Env]) -> Composition:
     """The groups' choices, as far as they make sense together."""
-    one_of("curriculum.name", config["curriculum"]["name"], list(CURRICULA))
-    curriculum = config["curriculum"]["name"] != "off"
+    name = config["curriculum"]["name"]
+    one_of("curriculum.name", name, list(CURRICULA))
+    curriculum = name != "off"
     boost, transfer = boost_of(config["boosting"]), transfer_of(config["transfer"])
     if len(tasks) == 1 and (curriculum or boost or transfer):
         key = "curriculum" if curriculum else "boosting" if boost else "transfer"
@@ -68,7 +69,6 @@ def composition(config: Plain, tasks: list[Env]) -> Composition:
             "about: boosting=off"
         )
         raise ConfigError("transfer", "residual_policy", why)
-    name = config["curriculum"]["name"]
     order = CURRICULA[name](len(tasks))
     if len(order) != len(tasks):
         why = f"has {len(order)} slots, budgets are lists with one entry a task"

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from bcrl.errors import ConfigError, at_least
-from bcrl.q import ZERO, Q
+from bcrl.q import ZERO, Q, Shaped, add
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,12 @@ class Start:
     shape: Shape | None = None  # None: rewards as they are
     prior: Q = ZERO
     steering: PolicyReuse | ResidualPolicy | None = None  # None: the own policy acts
+
+    def whole(self, residual: Q) -> Q:
+        """Q = base + `residual`, with what shaping took off the rewards put back."""
+        if self.shape is None:
+            return add(self.base, residual)
+        return Shaped(self.base, residual, self.potential)
 
 
 Transfer = Callable[[Start, Learned], Start]

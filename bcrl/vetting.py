@@ -79,7 +79,7 @@ def _refuse_nonsense(
         key = override.key_or_group
         if override.is_delete() and key in VARIANT_GROUPS:
             raise BcrlError(f"{key}: every run needs a choice of it")
-        if key in ("tuned", "budget/tuned"):
+        if key == "tuned":
             raise BcrlError(f"{key}: follows from the other choices; override its keys")
         value = override.value()
         if value is None and key in (*VARIANT_GROUPS, "variant"):

@@ -115,7 +115,7 @@ def run_of(start, settings=SMALL, env=TARGET, seeds=(0,), number=2):
 def put(run, state):
     """Move the mass of a single seed's run."""
     run.state = np.array([state], float)
-    run.known = run._frozen_values(run.state)
+    run.known = run._known(run.state)
 
 
 def stored(run, at=0):

@@ -7,6 +7,8 @@ from typing import ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.errors import ConfigError
+
 Step = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]
 
 
@@ -67,6 +69,14 @@ class FiniteEnv(Env, Protocol):
 
     def index(self, state: NDArray[np.float64]) -> NDArray[np.intp]:
         """Row of each state (..., d) in `states()`."""
+
+
+def check_episodes(gamma: float, horizon: int) -> None:
+    """Raise ConfigError for a discount outside [0, 1) or a horizon below 1."""
+    if not 0.0 <= gamma < 1.0:
+        raise ConfigError("env.gamma", gamma, "must lie in [0, 1)")
+    if horizon < 1:
+        raise ConfigError("env.horizon", horizon, "must be at least 1 step")
 
 
 def is_finite(env: Env) -> bool:

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.envs.base import Step
+from bcrl.envs.base import Step, check_episodes
 from bcrl.errors import ConfigError
 
 FORCE = 4.0  # N, to the left (action 0) or to the right (action 1)
@@ -58,10 +58,7 @@ class CarOnHill:
     def __post_init__(self) -> None:
         if not 0.0 < self.mass < math.inf:
             raise ConfigError("env.mass", self.mass, "must be positive and finite (kg)")
-        if not 0.0 <= self.gamma < 1.0:
-            raise ConfigError("env.gamma", self.gamma, "must lie in [0, 1)")
-        if self.horizon < 1:
-            raise ConfigError("env.horizon", self.horizon, "must be at least 1 step")
+        check_episodes(self.gamma, self.horizon)
 
     def initial(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
         """The valley (−0.5, 0) for noise of shape (..., 0)."""

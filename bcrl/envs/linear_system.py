@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.arrays import like, namespace, ndtri
-from bcrl.envs.base import Step
-from bcrl.errors import ConfigError, at_least, did_you_mean
+from bcrl.envs.base import Step, check_episodes
+from bcrl.errors import ConfigError, did_you_mean
 
 DT = 0.05  # s, Euler step
 NOISE = 1e-5  # standard deviation of the noise on each component of the derivative
@@ -86,9 +86,7 @@ class LinearSystem:
             value = getattr(self, key)
             if value not in allowed:
                 raise ConfigError(f"env.{key}", value, did_you_mean(value, allowed))
-        if not 0.0 <= self.gamma < 1.0:
-            raise ConfigError("env.gamma", self.gamma, "must lie in [0, 1)")
-        at_least("env.horizon", self.horizon, 1)
+        check_episodes(self.gamma, self.horizon)
 
     @property
     def constants(self) -> Constants:

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.envs.base import Step
+from bcrl.envs.base import Step, check_episodes
 from bcrl.errors import ConfigError, did_you_mean
 
 SIDE = 21  # lattice points along each axis
@@ -67,10 +67,7 @@ class Maze:
     def __post_init__(self) -> None:
         if not 0.0 <= self.height < 1.0:
             raise ConfigError("env.height", self.height, "must lie in [0, 1)")
-        if not 0.0 <= self.gamma < 1.0:
-            raise ConfigError("env.gamma", self.gamma, "must lie in [0, 1)")
-        if self.horizon < 1:
-            raise ConfigError("env.horizon", self.horizon, "must be at least 1 step")
+        check_episodes(self.gamma, self.horizon)
         if self.preset not in PRESETS:
             hint = did_you_mean(self.preset, PRESETS)
             raise ConfigError("env.preset", self.preset, hint)

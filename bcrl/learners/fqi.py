@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bcrl import data, rollout
 from bcrl.bellman import residual_target, shaping
 from bcrl.envs import is_finite
-from bcrl.q import ZERO, Fits, Shaped, Table, Values, add
+from bcrl.q import ZERO, Fits, Table, Values
 from bcrl.q.regressors import Fit, Problem, Regressor
 from bcrl.stage import Snapshot, Stage, Team
 from bcrl.streams import stream
@@ -85,10 +85,7 @@ class FQI:
                 learned = Learned(Table(q, env.index), Table(residual, env.index), sets)
             else:
                 own = Fits([tuple(row) for row in models], predict)
-                whole = add(start.base, own)
-                if start.shape is not None:
-                    whole = Shaped(start.base, own, start.potential)
-                learned = Learned(whole, own, sets)
+                learned = Learned(start.whole(own), own, sets)
             yield Iteration(
                 stage,
                 stage.before + k,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bcrl.bellman import frozen_part, shaping
 from bcrl.learners.update import updater
 from bcrl.policies import combined, greedy, uniform
-from bcrl.q import Q, Shaped, add
+from bcrl.q import Q
 from bcrl.q.mlp import Adam, DeepQ, Networks, xavier
 from bcrl.replay import Replay
 from bcrl.rollout import CHOICES, Policy
@@ -41,7 +41,6 @@ class Lockstep:
         )
         self._gradient_step = updater(self.deep, self.replay)
         self._ahead: NDArray | None = None  # ϱ's values at the state, if known
-        self.frozen = {id(q): q for q in (start.base, start.potential, start.prior)}
         self.table = (
             combined(self.env.actions)
             if isinstance(start.steering, ResidualPolicy)
@@ -54,7 +53,7 @@ class Lockstep:
             ]
         )
         self.state = self.env.initial(begin)  # (S, d)
-        self.known = self._frozen_values(self.state)
+        self.known = self._known(self.state)
         self.steps_in_episode = np.zeros(n, np.intp)
         self.decisions = np.zeros(n, np.intp)  # that were not random, for RPL's offset
         self.loss = np.zeros(n)  # summed over the updates since the last moment
@@ -74,12 +73,16 @@ class Lockstep:
         optimiser = Adam(flat, self.settings.learning_rate)
         return DeepQ(online, online.clone(), optimiser, 0)
 
-    def _frozen_values(self, state: NDArray) -> dict[int, NDArray]:
-        """Values (S, A) of base, potential and prior at states (S, d), by identity."""
-        asked = state[:, None]
-        return {
-            key: q(asked, self.env.n_actions)[:, 0] for key, q in self.frozen.items()
-        }
+    def _ask(self, states: NDArray, *frozen: Q) -> dict[int, NDArray]:
+        """Values (S, n, A) of Q-functions at states (S, n, d), each asked once."""
+        asked = {id(q): q for q in frozen}
+        return {key: q(states, self.env.n_actions) for key, q in asked.items()}
+
+    def _known(self, state: NDArray) -> dict[int, NDArray]:
+        """Values (S, A) of base, potential and prior at states (S, d), by id."""
+        start = self.start
+        values = self._ask(state[:, None], start.base, start.potential, start.prior)
+        return {key: each[:, 0] for key, each in values.items()}
 
     def act(self, step: int) -> None:
         """One step of every seed's environment, into its replay."""
@@ -95,7 +98,7 @@ class Lockstep:
         self.decisions += u[:, 0] >= epsilon
         noise = u[:, CHOICES : CHOICES + env.step_noise]
         after, reward, absorbing = env.step(self.state, action, noise)
-        known = self._frozen_values(after)
+        known = self._known(after)
         if start.shape is not None:
             reward = reward + self._shaping(action, noise, after, absorbing, known)
         base = np.take_along_axis(self.known[id(start.base)], own[:, None], -1)[:, 0]
@@ -115,7 +118,7 @@ class Lockstep:
             fresh = env.initial(u[:, CHOICES + env.step_noise :])
             after = np.where(over[:, None], fresh, after)
             self.steps_in_episode[over] = 0
-            known = self._frozen_values(after)
+            known = self._known(after)
         self.state, self.known = after, known
 
     def _draws(self, step: int) -> NDArray[np.float64]:
@@ -178,7 +181,7 @@ class Lockstep:
         next_values = known[key]
         if shape.next_state == "before_reset" and hasattr(self.env, "before_reset"):
             left = self.env.before_reset(self.state, action, noise)
-            next_values = self._frozen_values(left)[key]
+            next_values = self._ask(left[:, None], self.start.potential)[key][:, 0]
         return shaping(
             self.known[key].max(-1),
             next_values.max(-1),
@@ -208,14 +211,11 @@ class Lockstep:
             failed.setdefault(int(s), "non-finite loss")
         loss = self.loss / self.updates if self.updates else self.loss + np.nan
         self.loss, self.updates = np.zeros_like(loss), 0
-        q: Q = add(self.start.base, self.deep)
-        if self.start.shape is not None:
-            q = Shaped(self.start.base, self.deep, self.start.potential)
         return Moment(
             self.stage,
             self.stage.before + step,
             step == self.settings.length,
-            Learned(q, self.deep),
+            Learned(self.start.whole(self.deep), self.deep),
             self._policy(step),
             self.settings.evaluation_episodes,
             loss,
@@ -231,8 +231,7 @@ class Lockstep:
         epsilon, reuse = self.settings.evaluation_epsilon * halves, halves > 0
 
         def policy(now: NDArray, u: NDArray, alive: NDArray) -> NDArray:
-            asked = {id(q): q for q in (self.start.base, self.start.prior)}
-            frozen = {key: q(now, self.env.n_actions) for key, q in asked.items()}
+            frozen = self._ask(now, self.start.base, self.start.prior)
             own_values = self.deep(now, self.env.n_actions)
             own_values = self._whole(own_values, frozen[id(self.start.base)])
             prior = frozen[id(self.start.prior)]

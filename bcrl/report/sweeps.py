@@ -79,7 +79,7 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             continue
         if isinstance(value, Mapping) and value:
             yield from flatten(value, f"{prefix}{key}.")
-        elif key != "device":
+        else:
             yield f"{prefix}{key}", json.dumps(value, ensure_ascii=False)
 
 
