@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 TIE = 1e-9  # distances between actions that differ by less are equal
 
 
-def greedy(q: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.intp]:
+@numba.guvectorize(["(f8[:], f8, i8[:])"], "(a),()->()", cache=True)
+def greedy(q, u, action):
     """The best action of q (..., A); ties are broken uniformly by u (...) in [0, 1)."""
-    best = q == q.max(-1, keepdims=True)
-    rank = (u * best.sum(-1)).astype(np.intp)
-    return (best.cumsum(-1) > rank[..., None]).argmax(-1)
+    best, ties = q[0], 1
+    for a in range(1, len(q)):
+        if q[a] > best:
+            best, ties = q[a], 1
+        elif q[a] == best:
+            ties += 1
+    rank = int(u * ties)
+    action[0] = 0
+    for a in range(len(q)):
+        if q[a] == best:
+            if rank == 0:
+                action[0] = a
+            rank -= 1
 
 
 def uniform(n_actions: int, u: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -28,7 +28,9 @@ class Replay:
     """The last `capacity` transitions of each seed, and their targets' frozen parts.
 
     What base and shaping add to a target is fixed when a transition is stored, so it is
-    computed once and not for every batch that draws it.
+    computed once and not for every batch that draws it. `bootstrap` (S, capacity, 2)
+    has room for a row's max_a' (ϱ + base)(s') by the target network and for the number
+    of the target's copy that it is by, −1 in a new row.
     """
 
     def __init__(
@@ -40,6 +42,7 @@ class Replay:
         self.added = 0
         on_cpu = self.rows.device.type == "cpu"
         self._shared = self.rows.numpy() if on_cpu else None  # the same memory
+        self.bootstrap = np.full((n_seeds, capacity, 2), -1.0, np.float32)
         self._row = np.empty((n_seeds, width), np.float32)
         self._first = torch.arange(n_seeds, device=device)[:, None] * capacity
 
@@ -70,6 +73,7 @@ class Replay:
             self._shared[:, at] = row
         else:
             self.rows[:, at] = torch.from_numpy(row)
+        self.bootstrap[:, at, 1] = -1.0
         self.added += 1
 
     def places(self, u: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -89,32 +89,35 @@ def play(
     """Episodes from start (S, E, d); the last of u (S, T, E, …) are the env's noise."""
     n_seeds, n_episodes, d = start.shape
     horizon, noise = u.shape[1], u.shape[-1] - env.step_noise
-    state = np.zeros((n_seeds, n_episodes, horizon + 1, d))
-    state[:, :, 0] = start
+    lanes_of_a_step = (horizon, n_seeds, n_episodes)  # what is written at once is close
+    state = np.zeros((horizon + 1, n_seeds, n_episodes, d))
+    state[0] = start
     action = None
-    reward = np.zeros((n_seeds, n_episodes, horizon))
-    absorbing = np.zeros((n_seeds, n_episodes, horizon), bool)
+    reward = np.zeros(lanes_of_a_step)
+    absorbing = np.zeros(lanes_of_a_step, bool)
     length = np.zeros((n_seeds, n_episodes), np.intp)
     alive = np.ones((n_seeds, n_episodes), bool)
     for t in range(horizon):
-        now = state[:, :, t]
+        now = state[t]
         act = policy(now, u[:, t], alive)
         if action is None:
-            shape = (n_seeds, n_episodes, horizon, *act.shape[2:])
-            action = np.zeros(shape, act.dtype)
+            action = np.zeros((*lanes_of_a_step, *act.shape[2:]), act.dtype)
             step = env.push if act.dtype == np.float64 else env.step
         # Boolean masks copy; as long as all lanes live there is no need of one.
         lanes = (slice(None), slice(None)) if alive.all() else (alive,)
         length[lanes] += 1
-        action[:, :, t] = act
+        action[t] = act
         after, r, done = step(now[lanes], act[lanes], u[:, t, :, noise:][lanes])
-        state[:, :, t + 1] = now
-        state[(*lanes, t + 1)] = after
-        reward[(*lanes, t)], absorbing[(*lanes, t)] = r, done
+        state[t + 1] = now
+        state[t + 1][lanes] = after
+        reward[t][lanes], absorbing[t][lanes] = r, done
         alive[lanes] = ~done
         if not alive.any():
             break
-    return Episodes(state, action, reward, absorbing, length)
+    parts = (state, action, reward, absorbing)
+    # Copied, for sums over strides would depend on how many lanes there are.
+    by_lane = [np.ascontiguousarray(np.moveaxis(part, 0, 2)) for part in parts]
+    return Episodes(*by_lane, length)
 
 
 @functools.lru_cache(maxsize=64)

@@ -13,7 +13,8 @@ __all__ = ["Env", "FiniteEnv", "env_class", "env_names", "is_finite"]
 
 def env_names() -> list[str]:
     """Names of the environments that this package ships."""
-    return [m.name for m in pkgutil.iter_modules(__path__) if m.name != "base"]
+    found = (module.name for module in pkgutil.iter_modules(__path__))
+    return [name for name in found if name != "base" and not name.startswith("_")]
 
 
 def env_class(name: str) -> type:

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.arrays import like, namespace, ndtri
+from bcrl.envs import _point_mass as point_mass
+from bcrl.envs._point_mass import ACTION_COST, DT, GOAL_RADIUS, PATHWAY, START
 from bcrl.envs.base import Step, check_episodes
 from bcrl.errors import ConfigError, did_you_mean
 
-DT = 0.05  # s, Euler step
-NOISE = 1e-5  # standard deviation of the noise on each component of the derivative
 WALLS = (-5.0, 1.0)  # x of the two reflecting walls (target task)
-PATHWAY = 0.5  # |y| beyond which the target task starts anew
-GOAL_RADIUS = 0.2  # distance to the origin that counts as success
-STATE_COST = np.array([3.0, 1.0, 3.0, 1.0])  # diagonal, LQ task
-ACTION_COST = 0.1  # per squared unit of force, LQ task
-START = np.array([-4.0, 0.0, 0.0, 0.0])
 DIAGONAL = np.sqrt(0.5)
 ACTIONS = np.array(
     [[1, 0], [0, 1], [-1, 0], [0, -1]]
@@ -104,14 +100,26 @@ class LinearSystem:
         return (
             np.eye(4) + DT * drift,
             DT * push,
-            np.diag(STATE_COST),
+            np.diag(point_mass.STATE_COST),
             ACTION_COST * np.eye(2),
         )
 
+    @cached_property
+    def _dynamics(self) -> point_mass.Dynamics:
+        gain, friction, _ = self.constants
+        if self.task == "lq":
+            return point_mass.Dynamics(gain, friction, 0.0, -np.inf, np.inf)
+        return point_mass.Dynamics(gain, friction, self.drift, *WALLS)
+
+    @cached_property
+    def _for_lanes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Start box and dynamics as arrays."""
+        return np.array(self.constants.spread), np.array(self._dynamics)
+
     def initial(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
         """Start states (..., 4): the box around (−4, 0, 0, 0), for noise (..., 4)."""
-        spread = like(np.array(self.constants.spread), noise)
-        return like(START, noise) + spread * (2.0 * noise - 1.0)
+        found = point_mass.start(_components(noise), self.constants.spread)
+        return namespace(noise).stack(found, -1)
 
     def step(
         self,
@@ -130,18 +138,22 @@ class LinearSystem:
     ) -> Step:
         """One step with any force (..., 2); the fresh start, if any, is in `noise`."""
         xp = namespace(state)
-        moved = self._move(state, force, noise)
+        normal, uniform = ndtri(noise[..., :4]), noise[..., 4:]
+        if xp is np:
+            spread, dynamics = self._for_lanes
+            if self.task == "target":
+                return point_mass.pathway_lanes(
+                    state, force, normal, uniform, spread, dynamics
+                )
+            after, reward = point_mass.lq_lanes(state, force, normal, dynamics)
+            return after, reward, np.zeros_like(reward, bool)
+        moved = self._moved(state, force, normal)
         if self.task == "lq":
-            cost = (like(STATE_COST, moved) * moved**2).sum(-1)
-            cost = cost + ACTION_COST * (force**2).sum(-1)
-            return moved, -cost, xp.zeros_like(cost, dtype=bool)
-        fell = abs(moved[..., 2]) > PATHWAY
-        after = moved
-        if fell.any():
-            fresh = self.initial(noise[..., 4:])
-            after = xp.where(fell[..., None], fresh, moved)
-        arrived = after[..., 0] ** 2 + after[..., 2] ** 2 < GOAL_RADIUS**2
-        return after, xp.where(arrived, 0.0, -1.0), arrived
+            reward = point_mass.lq_reward(moved, _components(force))
+            return xp.stack(moved, -1), reward, xp.zeros_like(reward, dtype=bool)
+        fresh = point_mass.start(_components(uniform), self.constants.spread)
+        after, reward, arrived = point_mass.pathway(xp.where, moved, fresh)
+        return xp.stack(after, -1), reward, arrived
 
     def before_reset(
         self,
@@ -150,50 +162,15 @@ class LinearSystem:
         noise: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         """Where `step` leads before a fresh start replaces it, (..., 4)."""
-        return self._move(state, like(ACTIONS, state)[action], noise)
+        force, normal = like(ACTIONS, state)[action], ndtri(noise[..., :4])
+        if namespace(state) is np:
+            return point_mass.motion_lanes(state, force, normal, self._for_lanes[1])
+        return namespace(state).stack(self._moved(state, force, normal), -1)
 
-    def _move(
-        self,
-        state: NDArray[np.float64],
-        force: NDArray[np.float64],
-        noise: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
-        """Integrate and, in the target task, reflect."""
-        gain, friction, _ = self.constants
-        xp, drift = namespace(state), self.drift if self.task == "target" else 0.0
-        x_dot, y_dot = state[..., 1], state[..., 3]
-        pushed = gain * force
-        rate = [
-            x_dot + drift,
-            pushed[..., 0] - friction * x_dot,
-            y_dot,
-            pushed[..., 1] - friction * y_dot,
-        ]
-        noise = NOISE * ndtri(noise[..., :4])
-        moved = state + DT * (xp.stack(rate, -1) + noise)
-        if self.task == "lq":
-            return moved
-        low, high = WALLS
-        x = moved[..., 0]
-        beyond = (x < low) | (x > high)
-        if not beyond.any():
-            return moved
-        # Up to the contact in a straight line, then on without force and drift. Where
-        # the drift overcame the velocity, mirroring leads outside by a little: share 0.
-        wall = xp.where(x < low, low, high)
-        step = xp.where(x == state[..., 0], 1.0, x - state[..., 0])
-        share = xp.clip((wall - state[..., 0]) / step, 0.0, 1.0)
-        share = xp.where(beyond, share, 1.0)[..., None]
-        contact = state + share * (moved - state)
-        contact[..., 1] = -contact[..., 1]
-        onward = contact + (1.0 - share) * DT * self._coasting(contact)
-        return xp.where(beyond[..., None], onward, moved)
-
-    def _coasting(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The derivative without force, drift and noise, (..., 4)."""
-        xp, friction = namespace(state), self.constants.friction
-        x_dot, y_dot = state[..., 1], state[..., 3]
-        return xp.stack([x_dot, -friction * x_dot, y_dot, -friction * y_dot], -1)
+    def _moved(self, state: Any, force: Any, normal: Any) -> tuple[Any, ...]:
+        """`point_mass.motion` on whole tensors."""
+        parts = map(_components, (state, force, normal))
+        return point_mass.motion(namespace(state).where, *parts, self._dynamics)
 
     def evaluation_states(self) -> NDArray[np.float64]:
         """(−4, 0, 0, 0) and the corners of half the target's start box, (17, 4).
@@ -202,7 +179,9 @@ class LinearSystem:
         """
         half = 0.5 * np.array(PRESETS["released"]["target"].spread)
         signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 4, indexing="ij"), -1)
-        return START + half * np.vstack([np.zeros((1, 4)), signs.reshape(-1, 4)])
+        return np.array(START) + half * np.vstack(
+            [np.zeros((1, 4)), signs.reshape(-1, 4)]
+        )
 
     def plane(self, side: int = 41, extent: float = 5.0) -> NDArray[np.float64]:
         """The x–y plane [−extent, extent]² at zero velocity, x-major, (side², 4)."""
@@ -214,7 +193,7 @@ class LinearSystem:
     def scene(self) -> dict[str, NDArray[np.float64]]:
         """What a figure needs to draw the task: forces, pathway, goal, start, drift."""
         half = np.array(self.constants.spread)[[0, 2]]
-        at = START[[0, 2]]
+        at = np.array(START)[[0, 2]]
         return {
             "actions": ACTIONS,
             "pathway": np.array([WALLS[0], -PATHWAY, WALLS[1], PATHWAY]),
@@ -222,6 +201,11 @@ class LinearSystem:
             "start": np.concatenate([at - half, at + half]),
             "drift": np.array([self.drift, 0.0]),
         }
+
+
+def _components(array: Any) -> tuple[Any, ...]:
+    """The entries of the last axis, each an array of the leading axes."""
+    return tuple(array[..., i] for i in range(array.shape[-1]))
 
 
 ENV = LinearSystem

@@ -56,6 +56,7 @@ class Lockstep:
         self.known = self._known(self.state)
         self.steps_in_episode = np.zeros(n, np.intp)
         self.decisions = np.zeros(n, np.intp)  # that were not random, for RPL's offset
+        self._all = np.arange(n)
         self.loss = np.zeros(n)  # summed over the updates since the last moment
         self.updates = 0
 
@@ -71,7 +72,7 @@ class Lockstep:
         flat = torch.from_numpy(np.stack(drawn)).to(self.team.device)
         online = Networks(sizes, flat)
         optimiser = Adam(flat, self.settings.learning_rate)
-        return DeepQ(online, online.clone(), optimiser, 0)
+        return DeepQ(online, online.clone(), optimiser)
 
     def _ask(self, states: NDArray, *frozen: Q) -> dict[int, NDArray]:
         """Values (S, n, A) of Q-functions at states (S, n, d), each asked once."""
@@ -101,7 +102,7 @@ class Lockstep:
         known = self._known(after)
         if start.shape is not None:
             reward = reward + self._shaping(action, noise, after, absorbing, known)
-        base = np.take_along_axis(self.known[id(start.base)], own[:, None], -1)[:, 0]
+        base = self.known[id(start.base)][self._all, own]
         fixed, discount, next_base = frozen_part(
             reward,
             absorbing,
@@ -201,7 +202,7 @@ class Lockstep:
         """Count a step; every `target_update` steps the target becomes the online."""
         self.deep.steps += 1
         if self.deep.steps % self.settings.target_update == 0:
-            self.deep.target.flat.copy_(self.deep.online.flat)
+            self.deep.copy_target()
 
     def moment(self, step: int) -> Moment:
         """What there is to see after `step` steps of the stage."""

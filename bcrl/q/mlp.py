@@ -149,7 +149,8 @@ class DeepQ:
     online: Networks
     target: Networks
     optimiser: Adam
-    steps: int  # environment steps since the networks were new
+    steps: int = 0  # environment steps since the networks were new
+    copies: int = 0  # how often the target became the online network since then
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         if isinstance(states, np.ndarray):
@@ -176,4 +177,10 @@ class DeepQ:
             self.target.clone(),
             self.optimiser.clone(),
             self.steps,
+            self.copies,
         )
+
+    def copy_target(self) -> None:
+        """The target becomes the online network."""
+        self.target.flat.copy_(self.online.flat)
+        self.copies += 1

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,11 +54,27 @@ class Quadratic:
         return self.matrix[:, :d, :d], cross, alone + self.linear[:, d:] @ act.T
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        pure, cross, alone = self._parts
+        parts = self._parts
         if isinstance(states, np.ndarray):
-            square = (states @ pure * states).sum(-1, keepdims=True)
-            return states @ cross + alone[:, None] + square
-        return [
-            x @ cross[s] + alone[s] + (x @ pure[s] * x).sum(-1, keepdims=True)
-            for s, x in enumerate(states)
-        ]
+            return _values(states, *parts)
+        return [_values(x, *(part[s] for part in parts)) for s, x in enumerate(states)]
+
+
+@numba.guvectorize(
+    ["(f8[:,:], f8[:,:], f8[:,:], f8[:], f8[:,:])"],
+    "(n,d),(d,d),(d,a),(a)->(n,a)",
+    cache=True,
+)
+def _values(states, pure, cross, alone, values):
+    """xᵀ P x + x·C + c at states x (…, n, d)."""
+    n, d = states.shape
+    for i in range(n):
+        square = 0.0
+        for j in range(d):
+            for k in range(d):
+                square += states[i, j] * pure[j, k] * states[i, k]
+        for a in range(len(alone)):
+            value = alone[a] + square
+            for j in range(d):
+                value += states[i, j] * cross[j, a]
+            values[i, a] = value
