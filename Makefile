@@ -21,27 +21,19 @@ $(READY): pyproject.toml constraints.txt
 	@touch $@
 
 figures: $(READY) ## the paper's figures from runs of your own: 3 seeds a variant, minutes
-	$(BIN)/bcrl experiment=fig1 scale=quick
-	$(BIN)/bcrl experiment=fig2 scale=quick
-	$(BIN)/bcrl experiment=fig4 scale=quick workers=$(WORKERS)
+	$(BIN)/bcrl -m experiment=fig1,fig2,fig4 scale=quick workers=$(WORKERS)
 	$(BIN)/bcrl-report --scale quick
 
 paper: $(READY) ## the same at the paper's number of seeds
-	$(BIN)/bcrl experiment=fig1 scale=paper workers=$(WORKERS)
-	$(BIN)/bcrl experiment=fig2 scale=paper workers=$(WORKERS)
-	$(BIN)/bcrl experiment=fig4 scale=paper workers=$(WORKERS)
+	$(BIN)/bcrl -m experiment=fig1,fig2,fig4 scale=paper workers=$(WORKERS)
 	$(BIN)/bcrl-report --scale paper
 
 searches: $(READY) ## the searches of appendix C.3 on seeds of their own, with summary tables
-	$(BIN)/bcrl experiment=search_target_update workers=$(WORKERS)
-	$(BIN)/bcrl experiment=search_offset workers=$(WORKERS)
-	$(BIN)/bcrl experiment=search_nu workers=$(WORKERS)
+	$(BIN)/bcrl -m experiment=search_target_update,search_offset,search_nu workers=$(WORKERS)
 	$(BIN)/bcrl-report --scale search
 
 smoke: $(READY) ## every variant in seconds, then the report
-	$(BIN)/bcrl experiment=fig1 scale=smoke
-	$(BIN)/bcrl experiment=fig2 scale=smoke
-	$(BIN)/bcrl experiment=fig4 scale=smoke
+	$(BIN)/bcrl -m experiment=fig1,fig2,fig4 scale=smoke workers=$(WORKERS)
 	$(BIN)/bcrl-report --scale smoke
 
 test: $(READY) ## the tests

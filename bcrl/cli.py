@@ -1,4 +1,4 @@
-"""The `bcrl` command: vets what Hydra composes, then lets Hydra run it."""
+"""The `bcrl` command: vets what Hydra composes, then runs it, all jobs in one pool."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from bcrl import config, records, runner, vetting
+from bcrl.compose import Plan
 from bcrl.errors import BcrlError
 
 REFUSED = 2  # exit code
@@ -24,8 +25,12 @@ def main() -> None:
     options = [a for a in sys.argv[1:] if a not in arguments.overrides]
     sys.argv[1:] = options + arguments.overrides
     try:
-        _vet(arguments)
-        _run_job()
+        to_hydra = vetting.left_to_hydra(arguments)
+        plans = _vet(arguments)
+        if plans and not to_hydra:
+            runner.run(*plans)
+        else:
+            _run_job()
     except BcrlError as error:
         sys.exit(_complain(error))
     except KeyboardInterrupt:
@@ -33,7 +38,8 @@ def main() -> None:
         sys.exit(130)
 
 
-def _vet(arguments: Namespace) -> None:
+def _vet(arguments: Namespace) -> list[Plan]:
+    """The plans to run; none if the command line only wants to be shown something."""
     if arguments.experimental_rerun:
         raise BcrlError("--experimental-rerun: unpickles a file, which isn't supported")
     if arguments.config_path:
@@ -42,12 +48,14 @@ def _vet(arguments: Namespace) -> None:
         # Hydra composes for these too, and env is a required choice.
         if not any(o.startswith(("env=", "experiment=")) for o in arguments.overrides):
             sys.argv += ["env=maze"] * (not arguments.shell_completion)
-        return
+        return []
     plans = vetting.plans(arguments)
-    if not arguments.cfg and not arguments.info:
-        for plan in plans:
-            records.check_directory(plan)
-        records.make_directory(plans[0].root)
+    if arguments.cfg or arguments.info:
+        return []
+    for plan in plans:
+        records.check_directory(plan)
+    records.make_directory(plans[0].root)
+    return plans
 
 
 @hydra.main(

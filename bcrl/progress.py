@@ -1,7 +1,8 @@
-"""How far a run is: a bar on a terminal, else a line now and then."""
+"""How far all jobs are, and when they will be done: a bar, or a line now and then."""
 
 from __future__ import annotations
 
+import heapq
 import sys
 import time
 from collections.abc import Sequence
@@ -9,64 +10,98 @@ from dataclasses import dataclass
 
 from tqdm import tqdm
 
-LINE_EVERY = 0.1  # share of a run between two lines, where no stage ends
+LINE_EVERY = 0.1  # share of the work between two lines, where no job ends
+TRUST = 20.0  # seconds of work that the estimates weigh against what is measured
+
+
+@dataclass(frozen=True)
+class Job:
+    """A group of seeds that one process trains, and what that is expected to take."""
+
+    name: str  # "maze BC-FQI"
+    kind: str  # what is estimated alike: jobs of one kind are off by one factor
+    seeds: tuple[int, ...]
+    length: int  # iterations or steps
+    unit: str
+    seconds: float  # of one core, expected
 
 
 @dataclass(frozen=True)
 class Tick:
-    """How far a group of seeds is."""
+    """How far a job is."""
 
-    seeds: tuple[int, ...]
+    job: int  # number in the list of jobs
     task: int
     count: int  # iterations or steps done
-    last_of_stage: bool
+    spent: float  # seconds since it began
 
 
 class Progress:
-    """Shows ticks of one run; `mode` is bar, lines, none or auto."""
+    """Shows the ticks of jobs that `workers` take in order, in a mode of the YAML's."""
 
-    def __init__(
-        self, name: str, seeds: Sequence[int], length: int, unit: str, mode: str
-    ) -> None:
+    def __init__(self, jobs: Sequence[Job], workers: int, mode: str) -> None:
         if mode == "auto":
             mode = "bar" if sys.stderr.isatty() else "lines"
-        self.name, self.length, self.unit, self.mode = name, length, unit, mode
-        self.done, self.total = 0, len(seeds) * length
+        self.jobs, self.workers, self.mode = jobs, workers, mode
+        self.share = [0.0] * len(jobs)  # of each job, done
+        self.spent = [0.0] * len(jobs)
+        self.total = sum(job.seconds for job in jobs)
         self._shown = 0.0
-        self._counts: dict[tuple[int, ...], int] = {}
         self.began = time.monotonic()
-        shape = "{desc} |{bar}| {percentage:3.0f}% {elapsed}, {remaining} to go"
-        self.bar = (
-            tqdm(total=self.total, desc=name, bar_format=shape, leave=True)
-            if mode == "bar"
-            else None
-        )
+        shape = "{desc} |{bar}| {percentage:3.0f}% {elapsed}{postfix}"
+        self.bar = tqdm(total=1.0, bar_format=shape) if mode == "bar" else None
 
     def tick(self, tick: Tick) -> None:
-        """Count what a group has done since its last tick."""
-        new = len(tick.seeds) * (tick.count - self._counts.get(tick.seeds, 0))
-        self._counts[tick.seeds] = tick.count
-        self.done += new
+        """Note how far a job is, and show it."""
+        job = self.jobs[tick.job]
+        self.share[tick.job], self.spent[tick.job] = tick.count / job.length, tick.spent
         where = (
-            f"{self.name} · T{tick.task} · {self.unit} {tick.count}/{self.length}"
-            f" · {_named(tick.seeds)}"
+            f"{job.name} · T{tick.task} · {job.unit} {tick.count}/{job.length}"
+            f" · {_named(job.seeds)}"
         )
+        parts = zip(self.jobs, self.share, strict=True)
+        done = sum(each.seconds * share for each, share in parts) / self.total
         if self.bar is not None:
             self.bar.set_description_str(where, refresh=False)
-            self.bar.update(new)
-        elif self.mode == "lines" and new:
-            share = self.done / self.total
-            if tick.last_of_stage or share >= self._shown + LINE_EVERY:
-                self._shown = share
-                spent = time.monotonic() - self.began
-                left = f", {spent / share - spent:.0f} s to go" * (share >= LINE_EVERY)
-                line = f"{where} · {share:4.0%} · {spent:.0f} s{left}"
-                print(line, file=sys.stderr, flush=True)
+            self.bar.set_postfix_str(f"{_clock(self.to_go())} to go", refresh=False)
+            self.bar.update(done - self.bar.n)
+        elif self.mode == "lines" and (
+            tick.count == job.length or done >= self._shown + LINE_EVERY
+        ):
+            self._shown = done
+            spent = time.monotonic() - self.began
+            left = f", {_clock(self.to_go())} to go" * (done < 1.0)
+            line = f"{where} · {done:4.0%} · {_clock(spent)}{left}"
+            print(line, file=sys.stderr, flush=True)
+
+    def to_go(self) -> float:
+        """Seconds until the last job ends.
+
+        What was expected of the rest, corrected by what jobs of the kind have taken so
+        far, is handed to whichever worker is free next, as the runner does.
+        """
+        taken: dict[str, list[float]] = {"": [TRUST, TRUST]}
+        for job, share, spent in zip(self.jobs, self.share, self.spent, strict=True):
+            for kind in (job.kind, ""):
+                sums = taken.setdefault(kind, [TRUST, TRUST])
+                sums[0] += spent
+                sums[1] += job.seconds * share
+        free = [0.0] * self.workers
+        for job, share in zip(self.jobs, self.share, strict=True):
+            began = taken[job.kind][1] > TRUST
+            spent, expected = taken[job.kind if began else ""]
+            left = job.seconds * (1.0 - share) * spent / expected
+            heapq.heapreplace(free, free[0] + left)
+        return max(free)
 
     def close(self) -> None:
         """Leave the terminal tidy."""
         if self.bar is not None:
             self.bar.close()
+
+
+def _clock(seconds: float) -> str:
+    return tqdm.format_interval(seconds)
 
 
 def _named(seeds: Sequence[int]) -> str:

@@ -125,6 +125,35 @@ def write_seed(
     write_text(seed_path(directory, seed, "json"), dump)
 
 
+def closing_table(plans: Sequence[Plan], seconds: float) -> str:
+    """What the plans' complete seeds cost, a line a variant, as a table to print.
+
+    `seconds`: wall-clock time of this call.
+    """
+    head = f"{'':32}{'seeds':>7}{'failed':>8}{'CPU s a seed':>14}{'core min':>10}"
+    lines, total, peak = [head], 0.0, 0.0
+    for plan in plans:
+        facts = [
+            json.loads(seed_path(plan.directory, seed, "json").read_text())
+            for seed in plan.seeds
+        ]
+        spent = sum(fact["cpu_seconds"] for fact in facts)
+        failed = sum(fact["status"] != "complete" for fact in facts)
+        total += spent
+        peak = max(peak, *(fact["peak_memory_mib"] for fact in facts))
+        lines.append(
+            f"{plan.env + ' ' + plan.name:32}{len(facts):7}{failed:8}"
+            f"{spent / len(facts):14.2f}{spent / 60:10.1f}"
+        )
+    lines.append(f"{'in all':61}{total / 60:10.1f}")
+    workers = plans[0].config["workers"]
+    lines.append(
+        f"this call: {seconds / 60:.1f} min with {workers} worker(s); "
+        f"peak memory of a process that trains: {peak:.0f} MiB"
+    )
+    return "\n".join(lines)
+
+
 def provenance() -> dict[str, Any]:
     """Versions, git revision and machine."""
     return {

@@ -1,4 +1,4 @@
-"""The one runner: a plan's seeds, trained in lockstep groups, become records."""
+"""The one runner: the seeds of plans, trained in lockstep groups, become records."""
 
 from __future__ import annotations
 
@@ -9,40 +9,67 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
+from pathlib import Path
 
 import numpy as np
 
-from bcrl import oracle, records
+from bcrl import costs, oracle, records
 from bcrl.compose import Plan
+from bcrl.envs import Env
 from bcrl.evaluation import StepProbe
 from bcrl.probes import Probe
-from bcrl.progress import Progress, Tick
+from bcrl.progress import Job, Progress, Tick
 from bcrl.stage import Team, learn
 
 Seeds = tuple[int, ...]
 
 
-def run(plan: Plan) -> None:
-    """Compute every seed of the plan that is not complete yet, and record it."""
-    pending = records.open_directory(plan)
-    name = f"{plan.env} {plan.name}"
-    skipped = len(plan.seeds) - len(pending)
-    if skipped and plan.config["progress"] != "none":
-        print(f"{name}: {skipped} of {len(plan.seeds)} seeds complete", file=sys.stderr)
-    if not pending:
-        return
-    measured = plan.metrics if plan.family == "FQI" else ()
-    if any(metric.startswith("q_error") for metric in measured):
-        for task in dict.fromkeys((plan.target, *(s.env for s in plan.stages))):
-            oracle.reference(task)  # searched for once, here, and kept on disk
-    unit = _probe(plan, ()).index
-    progress = Progress(name, pending, plan.length, unit, plan.config["progress"])
-    try:
-        _train(plan, _groups(plan, pending), progress.tick)
-    finally:
-        progress.close()
+def run(*plans: Plan) -> None:
+    """Compute and record every seed of the plans that is not complete yet.
+
+    All of them share one pool of processes: jobs of a few seeds, the longest first.
+    """
+    began, options = time.perf_counter(), plans[0].config
+    work = ordered(plans)
+    if work:
+        _search_references([plan for plan, _ in work])
+        workers = min(options["workers"], len(work))
+        jobs = [_job(plan, seeds) for plan, seeds in work]
+        progress = Progress(jobs, workers, options["progress"])
+        try:
+            _train(work, workers, progress.tick)
+        finally:
+            progress.close()
+    if len(plans) > 1 and options["progress"] != "none":
+        spent = time.perf_counter() - began
+        print(records.closing_table(plans, spent), file=sys.stderr)
+
+
+def ordered(plans: Sequence[Plan]) -> list[tuple[Plan, Seeds]]:
+    """The jobs that remain to be done, the one expected to be longest first."""
+    return sorted(
+        _pending(plans), key=lambda each: -len(each[1]) * costs.expected(each[0])
+    )
+
+
+def _pending(plans: Sequence[Plan]) -> Iterator[tuple[Plan, Seeds]]:
+    """Groups of seeds that are to be trained, each seed of a directory once."""
+    taken: set[tuple[Path, int]] = set()
+    for plan in plans:
+        seeds = [
+            seed
+            for seed in records.open_directory(plan)
+            if (plan.directory, seed) not in taken
+        ]
+        taken |= {(plan.directory, seed) for seed in seeds}
+        skipped = len(plan.seeds) - len(seeds)
+        if skipped and plan.config["progress"] != "none":
+            said = f"{skipped} of {len(plan.seeds)} seeds complete"
+            print(f"{plan.env} {plan.name}: {said}", file=sys.stderr)
+        if seeds:
+            yield from ((plan, group) for group in _groups(plan, seeds))
 
 
 def _groups(plan: Plan, seeds: list[int]) -> list[Seeds]:
@@ -53,13 +80,36 @@ def _groups(plan: Plan, seeds: list[int]) -> list[Seeds]:
     return [tuple(part.tolist()) for part in np.array_split(seeds, groups)]
 
 
-def _train(plan: Plan, groups: list[Seeds], tick: Callable[[Tick], None]) -> None:
-    workers = min(plan.config["workers"], len(groups))
-    threads = plan.config["threads"] or max(1, _cores() // workers)
+def _search_references(plans: Sequence[Plan]) -> None:
+    """Q* of every task that is measured by it: searched for once and kept on disk."""
+    tasks: dict[Env, None] = {}
+    for plan in plans:
+        measured = plan.metrics if plan.family == "FQI" else ()
+        if any(metric.startswith("q_error") for metric in measured):
+            tasks |= dict.fromkeys((plan.target, *(s.env for s in plan.stages)))
+    for task in tasks:
+        oracle.reference(task)
+
+
+def _job(plan: Plan, seeds: Seeds) -> Job:
+    return Job(
+        f"{plan.env} {plan.name}",
+        f"{plan.env} {plan.family}",
+        seeds,
+        plan.length,
+        _probe(plan, ()).index,
+        costs.expected(plan) * len(seeds),
+    )
+
+
+def _train(
+    work: Sequence[tuple[Plan, Seeds]], workers: int, tick: Callable[[Tick], None]
+) -> None:
+    threads = work[0][0].config["threads"] or max(1, _cores() // workers)
     origin = records.provenance()  # of the code that starts, not of what it becomes
     if workers == 1:
-        for group in groups:
-            train_group(plan, group, threads, origin, tick)
+        for number, (plan, seeds) in enumerate(work):
+            train_group(plan, seeds, threads, origin, number, tick)
         return
     context = multiprocessing.get_context("spawn")
     with context.Manager() as manager:
@@ -67,8 +117,8 @@ def _train(plan: Plan, groups: list[Seeds], tick: Callable[[Tick], None]) -> Non
         pool = ProcessPoolExecutor(workers, context, initializer=_leave_interrupts)
         try:
             jobs = [
-                pool.submit(train_group, plan, group, threads, origin, ticks.put)
-                for group in groups
+                pool.submit(train_group, *each, threads, origin, number, ticks.put)
+                for number, each in enumerate(work)
             ]
             waiting = set(jobs)
             while waiting:
@@ -112,11 +162,13 @@ def train_group(
     seeds: Seeds,
     threads: int,
     origin: dict,
+    job: int,
     tick: Callable[[Tick], None],
 ) -> None:
     """Train a group of seeds in lockstep and write each seed's files.
 
-    origin: which code and machine, as `records.provenance` says.
+    origin: which code and machine, as `records.provenance` says; job: the number that
+    ticks are to bear.
     """
     wall, cpu = time.perf_counter(), time.process_time()
     probe = _probe(plan, seeds)
@@ -131,7 +183,7 @@ def train_group(
                 rows[s].append(where | metrics)
         for s, why in now.failed.items():
             failed.setdefault(s, f"{why} at {probe.index} {now.count}")
-        tick(Tick(seeds, task, now.count, now.last_of_stage))
+        tick(Tick(job, task, now.count, time.perf_counter() - wall))
     facts = probe.facts() | {
         "wall_seconds": time.perf_counter() - wall,
         "cpu_seconds": (time.process_time() - cpu) / len(seeds),  # this seed's share

@@ -34,6 +34,8 @@ RELEASED_OPTIONS = {
     ("boosting", "on"): "released",
     ("transfer", "shaping"): "shaping_released",
 }
+#: Hydra's keys that only matter in composing.
+COMPOSING = ("hydra.searchpath", "hydra.mode", "hydra.sweeper.params")
 Folders = tuple[str, ...]  # of configs, besides our own
 
 
@@ -52,13 +54,44 @@ def plans(arguments: Namespace) -> list[Plan]:
     for override in searchpath:
         folders += _folders(override.value())
     _refuse_nonsense(parsed, folders, arguments)
-    jobs = _jobs(name, parsed, bool(arguments.multirun), folders)
     planned = []
-    for job in jobs:
-        composed = _compose(name, tuple(job), folders)
-        planned.append(plan(composed, composed.hydra.runtime.choices, folders))
+    for overrides in _experiments(parsed, bool(arguments.multirun)):
+        for job in _jobs(name, overrides, bool(arguments.multirun), folders):
+            composed = _compose(name, tuple(job), folders)
+            planned.append(plan(composed, composed.hydra.runtime.choices, folders))
     _refuse_collisions(planned)
     return planned
+
+
+def left_to_hydra(arguments: Namespace) -> bool:
+    """Whether the command line asks for more of Hydra than composing its jobs.
+
+    Then Hydra runs them one by one, or hands them to a launcher. Raises BcrlError for a
+    sweep over experiments, which Hydra can't run.
+    """
+    parsed = _parse(arguments.overrides)
+    keys = [override.key_or_group for override in parsed]
+    asked = [k for k in keys if k.startswith("hydra") and not k.startswith(COMPOSING)]
+    if asked and any(
+        o.key_or_group == "experiment" and o.is_sweep_override() for o in parsed
+    ):
+        raise BcrlError(f"experiment: Hydra sweeps over one at a time; drop {asked[0]}")
+    return bool(asked)
+
+
+def _experiments(overrides: list[Override], multirun: bool) -> Iterator[list[Override]]:
+    """The overrides with each of the experiments that they sweep over."""
+    swept = [
+        o for o in overrides if o.key_or_group == "experiment" and o.is_sweep_override()
+    ]
+    if not swept:
+        yield overrides
+        return
+    if not multirun:
+        raise BcrlError("experiment: several values are a sweep; add -m")
+    rest = [o for o in overrides if o not in swept]
+    for name in swept[-1].sweep_string_iterator():
+        yield _parse([f"experiment={name}"]) + rest
 
 
 def _folders(searchpath: object) -> Folders:
@@ -84,10 +117,8 @@ def _refuse_nonsense(
         value = override.value()
         if value is None and key in (*VARIANT_GROUPS, "variant"):
             raise BcrlError(f"{key}=null: name an option, or leave {key} out")
-        if key == "experiment" and (
-            isinstance(value, list) or override.is_sweep_override()
-        ):
-            raise BcrlError("experiment: one at a time, each is a sweep of its own")
+        if key == "experiment" and isinstance(value, list):
+            raise BcrlError("experiment: one at a time, or -m experiment=fig1,fig2")
         if key == "budget":
             swept = override.is_sweep_override()
             _check_budgets(

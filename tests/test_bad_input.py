@@ -63,7 +63,7 @@ BAD = {
     ),
     "sweep without -m": ([MAZE, "curriculum=on,off"], ["curriculum", "-m"]),
     "two experiments": (["experiment=[fig1,fig2]"], ["experiment", "one at a time"]),
-    "swept experiments": (["experiment=fig1,fig2"], ["experiment", "one at a time"]),
+    "swept experiments": (["experiment=fig1,fig2"], ["experiment", "add -m"]),
     "unknown budget": ([MAZE, "budget=maze_fqy"], ["budget=maze_fqy", "maze_fqi"]),
     "swept budgets": ([MAZE, "budget=maze_fqi,nope"], ["budget=nope"]),
     "added key on top": ([MAZE, "+iterations=3"], ["iterations=3", "unknown key"]),

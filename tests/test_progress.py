@@ -1,0 +1,82 @@
+"""Many jobs in one pool: their order, what is left to go, the closing table."""
+
+import numpy as np
+import pytest
+
+from bcrl import costs, runner
+from bcrl.errors import BcrlError
+from bcrl.progress import TRUST, Job, Progress, Tick
+from tests.conftest import plans
+
+FIGURES = ("experiment=fig1,fig2,fig4", "scale=paper", "workers=2")
+
+
+def job(kind: str, seconds: float) -> Job:
+    return Job(kind, kind, (0,), 10, "step", seconds)
+
+
+def test_a_sweep_over_experiments_is_all_of_their_jobs():
+    found = plans(*FIGURES, multirun=True)
+    assert len(found) == 4 + 4 + 7
+    assert sum(len(p.seeds) for p in found) == 4 * 20 + 4 * 40 + 7 * 100  # all 940 runs
+    again = plans("experiment=fig2,fig3", "scale=smoke", multirun=True)
+    assert {p.directory for p in again} == {p.directory for p in again[:4]}
+
+
+def test_hydras_own_launchers_get_one_experiment_at_a_time(bcrl, tmp_path):
+    done = bcrl("-m", "experiment=fig1,fig2", "hydra.sweep.dir=x")
+    assert done.returncode == 2 and "one at a time" in done.stderr, done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_longest_jobs_come_first_and_each_seed_once(tmp_path):
+    out = ("progress=none", f"runs_dir={tmp_path}")
+    both = plans(*FIGURES[:1], "scale=quick", "workers=2", *out, multirun=True)
+    work = runner.ordered([*both, *both])
+    expected = [len(seeds) * costs.expected(plan) for plan, seeds in work]
+    assert expected == sorted(expected, reverse=True)
+    seeds = [(plan.directory, seed) for plan, group in work for seed in group]
+    assert len(seeds) == len(set(seeds)) == 15 * 3
+
+
+def test_what_is_left_is_a_schedule_of_what_is_expected():
+    jobs = [job("a", 60.0), job("a", 50.0), job("b", 40.0), job("b", 10.0)]
+    progress = Progress(jobs, 2, "none")
+    assert progress.to_go() == pytest.approx(90.0)  # 60 + 10 beside 50 + 40
+    for number, spent in ((0, 120.0), (1, 100.0)):  # twice as slow as expected
+        progress.tick(Tick(number, 1, 10, spent))
+    slower = (220.0 + TRUST) / (110.0 + TRUST)
+    assert progress.to_go() == pytest.approx(40.0 * slower)
+    progress.tick(Tick(2, 1, 5, 20.0))  # but this kind is as fast as expected
+    assert progress.to_go() == pytest.approx(20.0)
+
+
+def test_the_estimate_is_right_when_the_model_is_off_by_a_factor():
+    rng = np.random.default_rng(0)
+    jobs = [job("a", s) for s in sorted(rng.uniform(50, 100, 20), reverse=True)]
+    progress, clock = Progress(jobs, 2, "none"), [0.0, 0.0]
+    for number, each in enumerate(jobs):
+        clock[np.argmin(clock)] += 1.5 * each.seconds
+        progress.tick(Tick(number, 1, 10, 1.5 * each.seconds))
+        if number == 5:
+            early = clock[np.argmin(clock)] + progress.to_go()
+    assert early == pytest.approx(max(clock), rel=0.1)
+
+
+def test_the_closing_table_counts_every_run(bcrl, tmp_path):
+    small = ("scale=smoke", "seeds.count=1", "algorithm/regressor=tabular", "tag=t")
+    sweep = ("-m", "env=maze", "curriculum=on,off", *small)
+    for _ in range(2):  # the second finds all complete
+        done = bcrl(*sweep)
+        assert done.returncode == 0, done.stderr
+        lines = [line.split() for line in done.stderr.splitlines()]
+        assert [line[:4] for line in lines if line[:1] == ["maze"]][-2:] == [
+            ["maze", "C-FQI@t", "1", "0"],
+            ["maze", "FQI@t", "1", "0"],
+        ]
+        assert "peak memory" in done.stderr
+
+
+def test_an_unknown_experiment_among_several_is_named():
+    with pytest.raises(BcrlError, match="fig11"):
+        plans("experiment=fig1,fig11", multirun=True)
