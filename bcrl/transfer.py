@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from bcrl.errors import ConfigError, at_least
-from bcrl.q import ZERO, Q, Shaped, add
+from bcrl.q import ZERO, Q, Shaped, add, remembered
 
 
 @dataclass(frozen=True)
@@ -110,6 +110,13 @@ class Start:
         if self.shape is None:
             return add(self.base, residual)
         return Shaped(self.base, residual, self.potential)
+
+    def remembered(self) -> Start:
+        """The same start, its base and potential asked only once at each state."""
+        base = remembered(self.base)
+        same = self.potential is self.base
+        potential = base if same else remembered(self.potential)
+        return replace(self, base=base, potential=potential)
 
 
 Transfer = Callable[[Start, Learned], Start]

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -316,3 +322,35 @@ def test_estimator_counts_multiplicities_and_ignores_jobs():
     assert (one.predict(points) == two.predict(points)).all()
     with pytest.raises(ValueError, match="multiplicity"):
         one.fit(x, y, counts * 0)
+
+
+def test_a_plain_processor_grows_the_same_trees():
+    """Without AVX-512 rows move one by one; the forests are the same bytes."""
+    code = (
+        "import tests.test_forest as t, hashlib\n"
+        "print(hashlib.sha256(t.grown_bytes()).hexdigest())"
+    )
+    plain = dict(os.environ, NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="")
+    root = Path(__file__).parents[1]
+    found = subprocess.run(
+        [sys.executable, "-c", code],
+        env=plain,
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert found.stdout.strip() == hashlib.sha256(grown_bytes()).hexdigest()
+
+
+def grown_bytes() -> bytes:
+    """Trees and predictions of forests with and without multiplicities."""
+    rng = np.random.default_rng(11)
+    x = rng.normal(size=(700, 2)).astype(np.float32)
+    y, counts = np.sin(3 * x[:, 0]) + x[:, 1], rng.integers(1, 5, 700)
+    tasks = [Regression(x, y, seeds(5), how, x[::3] / 2) for how in (None, counts)]
+    parts = [
+        (fit.forest.nodes, fit.forest.values, fit.fitted, fit.queried)
+        for fit in fit_forests(tasks, PAPER)
+    ]
+    return b"".join(array.tobytes() for part in parts for array in part)

@@ -510,3 +510,21 @@ def test_stages_stacked_with_shaping_and_boosting_are_asked_once_each():
     for _ in range(10):
         q = Shaped(q, ZERO, q)
     assert (q(states, 2)[0] == 2.0**10).all() and first.asked == 1
+
+
+@pytest.mark.parametrize("stacked", [True, False])
+def test_a_remembered_q_is_the_same_q_asked_once_a_state(stacked):
+    asked = []
+
+    def q(states, n_actions):
+        asked.extend(len(x) for x in states)
+        return [np.repeat(x[:, :1], n_actions, 1) for x in states]
+
+    start = Start(base=q).remembered()
+    assert start.potential is ZERO and Start().remembered() == Start()
+    states = np.random.default_rng(0).normal(size=(2, 4, 3))
+    for rows in (slice(0, 2), slice(1, 4), slice(0, 0), slice(0, 4)):
+        now = states[:, rows] if stacked else [x[rows] for x in states]
+        for x, values in zip(now, start.base(now, 2), strict=True):
+            assert values.shape == (len(x), 2) and (values == x[:, :1]).all()
+    assert sum(asked) == 8  # four states of either seed

@@ -70,6 +70,7 @@ class FQI:
             else [[None] * env.n_actions for _ in sets]
         )
         predict = functools.partial(_predict, self.regressor, team.threads)
+        evaluated = start.remembered()  # the next stage's base should not remember
         for k in range(1, self.iterations + 1):
             residual = [values.copy() for values in residual]
             fits = self._fit(stage, k, team, rewards, sets, base, residual)
@@ -85,7 +86,8 @@ class FQI:
                 learned = Learned(Table(q, env.index), Table(residual, env.index), sets)
             else:
                 own = Fits([tuple(row) for row in models], predict)
-                learned = Learned(start.whole(own), own, sets)
+                whole = start if k == self.iterations else evaluated
+                learned = Learned(whole.whole(own), own, sets)
             yield Iteration(
                 stage,
                 stage.before + k,

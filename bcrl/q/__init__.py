@@ -82,6 +82,39 @@ def add(base: Q, residual: Q) -> Q:
     return terms[0] if len(terms) == 1 else Sum(tuple(terms)) if terms else ZERO
 
 
+class Remembered:
+    """A frozen Q that is asked once at each state.
+
+    The greedy episodes of an iteration meet most of the states of those before.
+    """
+
+    def __init__(self, q: Q) -> None:
+        self.q = q
+        self._known: dict[int, dict[bytes, NDArray[np.float64]]] = {}  # by seed
+
+    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        known = [self._known.setdefault(s, {}) for s in range(len(states))]
+        keys = [[state.tobytes() for state in x] for x in states]
+        new = [
+            [i for i, key in enumerate(row) if key not in found]
+            for row, found in zip(keys, known, strict=True)
+        ]
+        if any(new):
+            asked = [x[rows] for x, rows in zip(states, new, strict=True)]
+            values = self.q(asked, n_actions)
+            for s, rows in enumerate(new):
+                known[s].update(zip((keys[s][i] for i in rows), values[s], strict=True))
+        return each(
+            states,
+            lambda s: np.array([known[s][k] for k in keys[s]]).reshape(-1, n_actions),
+        )
+
+
+def remembered(q: Q) -> Q:
+    """`q`, asked once at each state; zero costs nothing and stays itself."""
+    return q if q is ZERO else Remembered(q)
+
+
 @dataclass(frozen=True)
 class Table:
     """Tabulated Q of a finite environment: one array (N, A) a seed."""

@@ -13,12 +13,12 @@ from pathlib import Path
 
 from numba import njit
 
-from bcrl.q import descend, grow, kernel, rows
+from bcrl.q import descend, grow, kernel, lanes, rows
 
 
 def _fingerprint() -> int:
     digest = hashlib.sha256()
-    for module in (kernel, rows, grow, descend):
+    for module in (lanes, kernel, rows, grow, descend):
         digest.update(Path(module.__file__).read_bytes())
     return int.from_bytes(digest.digest()[:6], "big")
 

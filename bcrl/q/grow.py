@@ -59,10 +59,9 @@ def grow_tree(
         ):
             if both:
                 split, state = choose_two(
-                    keys,
+                    words,
                     target,
                     weight,
-                    base,
                     here,
                     start,
                     stop,

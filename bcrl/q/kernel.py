@@ -21,6 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from bcrl.q.lanes import extremes, tally, tally_weighted
+
 #: One tree node, 12 bytes: rows with `key <= cut` go to node `child`, others to
 #: `child + 1`; a leaf has feature −1 and its value at `child` in the leaf values.
 NODE = np.dtype([("cut", np.int32), ("feature", np.int32), ("child", np.int32)])
@@ -128,39 +130,20 @@ def gain(low, high, weight, total, node_weight, node_total, min_leaf):
 
 @woven
 def choose_two(
-    keys, target, weight, base, here, start, stop, w_node, s_node, min_leaf, state
+    words, target, weight, here, start, stop, w_node, s_node, min_leaf, state
 ):
     """`choose` for two features, both tried: both in one pass over the rows."""
-    low0 = high0 = keys[base + TWO * start]
-    low1 = high1 = keys[base + TWO * start + ONE]
-    for i in range(start + ONE, stop):
-        key0, key1 = keys[base + TWO * i], keys[base + TWO * i + ONE]
-        low0, high0 = min(low0, key0), max(high0, key0)
-        low1, high1 = min(low1, key1), max(high1, key1)
+    first, last = here + start, here + stop
+    low0, high0, low1, high1 = extremes(words, first, last)
     state += GOLDEN
     bits = mix(state)
     cut0 = draw_cut(low0, high0, bits >> U(32))
     cut1 = draw_cut(low1, high1, bits & LOW32)
-    w0 = w1 = s0 = s1 = np.int64(0)
     if weight.size > 0:
-        for i in range(start, stop):
-            w = weight[here + i]
-            wy = w * target[here + i]
-            goes0 = -np.int64(keys[base + TWO * i] <= cut0)  # all bits set, or none
-            goes1 = -np.int64(keys[base + TWO * i + ONE] <= cut1)
-            w0 += w & goes0
-            s0 += wy & goes0
-            w1 += w & goes1
-            s1 += wy & goes1
+        found = tally_weighted(words, target, weight, first, last, cut0, cut1)
     else:
-        for i in range(start, stop):
-            y = target[here + i]
-            goes0 = -np.int64(keys[base + TWO * i] <= cut0)
-            goes1 = -np.int64(keys[base + TWO * i + ONE] <= cut1)
-            w0 -= goes0
-            s0 += y & goes0
-            w1 -= goes1
-            s1 += y & goes1
+        found = tally(words, target, first, last, cut0, cut1)
+    w0, s0, w1, s1 = found
     gain0 = gain(low0, high0, w0, s0, w_node, s_node, min_leaf)
     gain1 = gain(low1, high1, w1, s1, w_node, s_node, min_leaf)
     second = gain1 > gain0
