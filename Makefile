@@ -46,6 +46,7 @@ lint: $(READY) ## style and unused code
 bench: $(READY) ## speed, as ratios against the plain way in one run
 	$(BIN)/python bench/forest.py
 	$(BIN)/python bench/iteration.py
+	$(BIN)/python bench/growth.py
 	$(BIN)/python bench/dqn.py
 
 clean: ## remove .venv and caches; results in runs/ stay
