@@ -6,10 +6,10 @@ READY := $(VENV)/.ready
 WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup figures paper searches smoke test lint bench clean
+.PHONY: help setup figures paper searches smoke test lint bench bench-peer clean
 
 help: ## this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: $(READY) ## install everything into .venv, at the exact versions of constraints.txt
 
@@ -49,6 +49,13 @@ bench: $(READY) ## speed, as ratios against the plain way in one run
 	$(BIN)/python bench/growth.py
 	$(BIN)/python bench/dqn.py
 
+bench-peer: $(READY) ## the same against MushroomRL 1.10.2, in an environment of its own
+	test -x .venv-peer/bin/python || $(PYTHON) -m venv .venv-peer
+	.venv-peer/bin/python -m pip install --quiet --constraint constraints.txt --editable .
+	.venv-peer/bin/python -m pip install --quiet pygame opencv-python-headless
+	.venv-peer/bin/python -m pip install --quiet --no-deps mushroom-rl==1.10.2
+	.venv-peer/bin/python bench/peer.py
+
 clean: ## remove .venv and caches; results in runs/ stay
-	rm -rf $(VENV) .pytest_cache .ruff_cache
+	rm -rf $(VENV) .venv-peer .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

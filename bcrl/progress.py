@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from tqdm import tqdm
 
 LINE_EVERY = 0.1  # share of the work between two lines, where no job ends
+SILENCE = 30.0  # seconds after which a line is due anyhow
 TRUST = 20.0  # seconds of work that the estimates weigh against what is measured
 
 
@@ -46,8 +47,8 @@ class Progress:
         self.share = [0.0] * len(jobs)  # of each job, done
         self.spent = [0.0] * len(jobs)
         self.total = sum(job.seconds for job in jobs)
-        self._shown = 0.0
         self.began = time.monotonic()
+        self._shown = (0.0, self.began)  # share and time of the last line
         shape = "{desc} |{bar}| {percentage:3.0f}% {elapsed}{postfix}"
         self.bar = tqdm(total=1.0, bar_format=shape) if mode == "bar" else None
 
@@ -65,14 +66,15 @@ class Progress:
             self.bar.set_description_str(where, refresh=False)
             self.bar.set_postfix_str(f"{_clock(self.to_go())} to go", refresh=False)
             self.bar.update(done - self.bar.n)
-        elif self.mode == "lines" and (
-            tick.count == job.length or done >= self._shown + LINE_EVERY
-        ):
-            self._shown = done
-            spent = time.monotonic() - self.began
-            left = f", {_clock(self.to_go())} to go" * (done < 1.0)
-            line = f"{where} · {done:4.0%} · {_clock(spent)}{left}"
-            print(line, file=sys.stderr, flush=True)
+        elif self.mode == "lines":
+            now = time.monotonic()
+            share, last = self._shown
+            due = done >= share + LINE_EVERY or now >= last + SILENCE
+            if due or tick.count == job.length:
+                self._shown = done, now
+                left = f", {_clock(self.to_go())} to go" * (done < 1.0)
+                line = f"{where} · {done:4.0%} · {_clock(now - self.began)}{left}"
+                print(line, file=sys.stderr, flush=True)
 
     def to_go(self) -> float:
         """Seconds until the last job ends.

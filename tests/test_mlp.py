@@ -132,6 +132,30 @@ def test_gradients_and_adam_are_torchs(way, hidden):
             assert torch.equal(deep.target.flat[s], flattened(target))
 
 
+@WAYS
+def test_a_batch_meets_the_target_of_now_and_rows_of_now(way):
+    """Bootstrap values are kept: till the target is copied, or a row overwritten."""
+    seeds, steps = (0, 1), 9
+    deep, replay = learner((16,), seeds, rate=0.05), filled(seeds)
+    at = places(seeds, steps, n=20)  # the same rows again and again
+    other = filled((7, 8)).rows
+    update = way(deep, replay)
+    for step in range(steps):
+        if step in (3, 6):
+            deep.copy_target()
+        if step == 5:  # the oldest rows are overwritten, the rest of the ring too
+            for i in range(replay.capacity):
+                cut = np.cumsum([D, D, A, 1, 1])
+                parts = np.split(other[:, i % 200].numpy(), cut, axis=1)
+                *arrays, fixed, discount, action = parts
+                replay.add(*arrays, fixed[:, 0], discount[:, 0], action[:, 0])
+        now = [(module(deep.online, s), module(deep.target, s)) for s in range(2)]
+        losses = losses_of(update, at[step])
+        for s, (online, target) in enumerate(now):
+            expected = loss_of(online, target, replay.rows[s, at[step, s]]).item()
+            assert losses[s] == pytest.approx(expected, rel=1e-4), (step, s)
+
+
 @HIDDEN
 def test_the_stacked_forward_pass_is_torchs(hidden):
     many, x = networks(hidden, (0, 3)), torch.randn(2, 7, D, generator=_generator())

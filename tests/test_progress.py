@@ -5,7 +5,7 @@ import pytest
 
 from bcrl import costs, runner
 from bcrl.errors import BcrlError
-from bcrl.progress import TRUST, Job, Progress, Tick
+from bcrl.progress import SILENCE, TRUST, Job, Progress, Tick
 from tests.conftest import plans
 
 FIGURES = ("experiment=fig1,fig2,fig4", "scale=paper", "workers=2")
@@ -80,3 +80,23 @@ def test_the_closing_table_counts_every_run(bcrl, tmp_path):
 def test_an_unknown_experiment_among_several_is_named():
     with pytest.raises(BcrlError, match="fig11"):
         plans("experiment=fig1,fig11", multirun=True)
+
+
+def test_a_line_is_due_after_a_while_of_silence(monkeypatch, capsys):
+    now = [1000.0]
+    monkeypatch.setattr("bcrl.progress.time.monotonic", lambda: now[0])
+    progress = Progress([job("a", 1000.0)], 1, "lines")
+    progress.tick(Tick(0, 1, 0, 0.0))
+    assert not capsys.readouterr().err
+    now[0] += SILENCE
+    progress.tick(Tick(0, 1, 0, SILENCE))
+    assert "step 0/10 · seed 0" in capsys.readouterr().err
+
+
+def test_hydra_runs_the_jobs_where_more_of_it_is_asked_for(bcrl, tmp_path):
+    small = ("scale=smoke", "seeds.count=1", "algorithm/regressor=tabular", "tag=t")
+    done = bcrl("-m", "env=maze", "curriculum=on,off", *small, "hydra.sweep.dir=here")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "here/multirun.yaml").exists()
+    made = tmp_path.glob("runs/smoke/maze/*/seed_0000.csv")
+    assert sorted(p.parent.name for p in made) == ["C-FQI@t", "FQI@t"]
