@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.arrays import per_lane
+
 
 def residual_target(
     reward: NDArray[np.float64],
@@ -37,14 +39,28 @@ def frozen_part(
     with max ϱ(s') + max base(s'), and without the mask an absorbing next state still
     counts with max base(s') [released]. Shapes as in `residual_target`.
     """
-    discount = np.where(absorbing, 0.0, gamma)
-    alone = np.zeros_like(reward) if mask_at_goal else np.where(absorbing, gamma, 0.0)
-    if maxima == "two":
-        alone = alone + discount
-        inside = np.zeros_like(next_base)
-    else:
-        inside = next_base
-    return reward + alone * next_base.max(-1) - base, discount, inside
+    two = maxima == "two"
+    return _frozen_part(
+        reward, absorbing, next_base, base, gamma, two, not mask_at_goal
+    )
+
+
+@per_lane(
+    "(f8, b1, f8[:], f8, f8, b1, b1, f8[:], f8[:], f8[:])",
+    "(),(),(a),(),(),(),()->(),(),(a)",
+)
+def _frozen_part(
+    reward, absorbing, next_base, base, gamma, two, unmasked, fixed, discount, inside
+):
+    best = next_base[0]
+    for a in range(len(next_base)):
+        best = max(best, next_base[a])
+        inside[a] = 0.0 if two else next_base[a]
+    discount[0] = 0.0 if absorbing else gamma
+    alone = gamma if unmasked and absorbing else 0.0
+    if two:
+        alone += discount[0]
+    fixed[0] = reward + alone * best - base
 
 
 def shaping(
@@ -55,6 +71,9 @@ def shaping(
     zero_at_goal: bool = True,
 ) -> NDArray[np.float64]:
     """γ V(s') − V(s), with V(s') = 0 in absorbing s' if `zero_at_goal` (Ng 1999)."""
-    if zero_at_goal:
-        next_value = np.where(absorbing, 0.0, next_value)
-    return gamma * next_value - value
+    return _shaping(value, next_value, absorbing, gamma, zero_at_goal)
+
+
+@per_lane("(f8, f8, b1, f8, b1, f8[:])", "(),(),(),(),()->()")
+def _shaping(value, next_value, absorbing, gamma, zero_at_goal, extra):
+    extra[0] = (0.0 if zero_at_goal and absorbing else gamma * next_value) - value

@@ -25,9 +25,8 @@ def main() -> None:
     options = [a for a in sys.argv[1:] if a not in arguments.overrides]
     sys.argv[1:] = options + arguments.overrides
     try:
-        to_hydra = vetting.left_to_hydra(arguments)
         plans = _vet(arguments)
-        if plans and not to_hydra:
+        if plans and not vetting.left_to_hydra(arguments):
             runner.run(*plans)
         else:
             _run_job()

@@ -6,12 +6,13 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.arrays import per_lane
+
 TIE = 1e-9  # distances between actions that differ by less are equal
 
 
-@numba.guvectorize(["(f8[:], f8, i8[:])"], "(a),()->()", cache=True)
-def greedy(q, u, action):
-    """The best action of q (..., A); ties are broken uniformly by u (...) in [0, 1)."""
+@numba.njit
+def _best(q, u):
     best, ties = q[0], 1
     for a in range(1, len(q)):
         if q[a] > best:
@@ -19,12 +20,25 @@ def greedy(q, u, action):
         elif q[a] == best:
             ties += 1
     rank = int(u * ties)
-    action[0] = 0
     for a in range(len(q)):
         if q[a] == best:
             if rank == 0:
-                action[0] = a
+                return a
             rank -= 1
+    return 0  # values that are not numbers
+
+
+@per_lane("(f8[:], f8, i8[:])", "(a),()->()")
+def greedy(q, u, action):
+    """The best action of q (..., A); ties are broken uniformly by u (...) in [0, 1)."""
+    action[0] = _best(q, u)
+
+
+@per_lane("(f8[:], f8, f8, f8, i8[:], b1[:])", "(a),(),(),()->(),()")
+def epsilon_greedy(q, explore, u, epsilon, action, random):
+    """`greedy`, or `uniform` where `explore` (...) is below ε; and where that is so."""
+    random[0] = explore < epsilon
+    action[0] = int(u * len(q)) if random[0] else _best(q, u)
 
 
 def uniform(n_actions: int, u: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 LINE_EVERY = 0.1  # share of the work between two lines, where no job ends
 SILENCE = 30.0  # seconds after which a line is due anyhow
+REFRESH = 0.5  # seconds between two estimates in a bar
 TRUST = 20.0  # seconds of work that the estimates weigh against what is measured
 
 
@@ -46,7 +47,7 @@ class Progress:
         self.jobs, self.workers, self.mode = jobs, workers, mode
         self.share = [0.0] * len(jobs)  # of each job, done
         self.spent = [0.0] * len(jobs)
-        self.total = sum(job.seconds for job in jobs)
+        self.total, self.done = sum(job.seconds for job in jobs), 0.0  # seconds
         self.began = time.monotonic()
         self._shown = (0.0, self.began)  # share and time of the last line
         shape = "{desc} |{bar}| {percentage:3.0f}% {elapsed}{postfix}"
@@ -55,24 +56,27 @@ class Progress:
     def tick(self, tick: Tick) -> None:
         """Note how far a job is, and show it."""
         job = self.jobs[tick.job]
-        self.share[tick.job], self.spent[tick.job] = tick.count / job.length, tick.spent
+        share, self.spent[tick.job] = tick.count / job.length, tick.spent
+        self.done += job.seconds * (share - self.share[tick.job])
+        self.share[tick.job] = share
         where = (
             f"{job.name} · T{tick.task} · {job.unit} {tick.count}/{job.length}"
             f" · {_named(job.seeds)}"
         )
-        parts = zip(self.jobs, self.share, strict=True)
-        done = sum(each.seconds * share for each, share in parts) / self.total
+        all_done = sum(self.share) == len(self.jobs)
+        done = 1.0 if all_done else self.done / self.total
+        now, (shown, last) = time.monotonic(), self._shown
         if self.bar is not None:
             self.bar.set_description_str(where, refresh=False)
-            self.bar.set_postfix_str(f"{_clock(self.to_go())} to go", refresh=False)
+            if now >= last + REFRESH or all_done:
+                self._shown = done, now
+                self.bar.set_postfix_str(f"{_clock(self.to_go())} to go", refresh=False)
             self.bar.update(done - self.bar.n)
         elif self.mode == "lines":
-            now = time.monotonic()
-            share, last = self._shown
-            due = done >= share + LINE_EVERY or now >= last + SILENCE
+            due = done >= shown + LINE_EVERY or now >= last + SILENCE
             if due or tick.count == job.length:
                 self._shown = done, now
-                left = f", {_clock(self.to_go())} to go" * (done < 1.0)
+                left = f", {_clock(self.to_go())} to go" * (not all_done)
                 line = f"{where} · {done:4.0%} · {_clock(now - self.began)}{left}"
                 print(line, file=sys.stderr, flush=True)
 

@@ -59,14 +59,17 @@ def make_directory(directory: Path) -> None:
         ) from error
 
 
-def open_directory(plan: Plan) -> list[int]:
-    """Make the directory; the plan's seeds that are not complete yet."""
+def pending(plan: Plan) -> list[int]:
+    """The plan's seeds that are not complete yet; BcrlError as `check_directory`."""
     check_directory(plan)
-    directory = plan.directory
-    make_directory(directory)
+    return [seed for seed in plan.seeds if not is_complete(plan.directory, seed)]
+
+
+def begin(plan: Plan) -> None:
+    """Make the plan's directory, with its config."""
+    make_directory(plan.directory)
     text = yaml.safe_dump(identity(plan.config), sort_keys=False, allow_unicode=True)
-    write_text(directory / "config.yaml", text)
-    return [seed for seed in plan.seeds if not is_complete(directory, seed)]
+    write_text(plan.directory / "config.yaml", text)
 
 
 def seed_path(directory: Path, seed: int, suffix: str) -> Path:
@@ -126,7 +129,7 @@ def write_seed(
 
 
 def closing_table(plans: Sequence[Plan], seconds: float) -> str:
-    """What the plans' complete seeds cost, a line a variant, as a table to print.
+    """What all seeds of the plans have cost, a line a variant, as a table to print.
 
     `seconds`: wall-clock time of this call.
     """
@@ -137,10 +140,10 @@ def closing_table(plans: Sequence[Plan], seconds: float) -> str:
             json.loads(seed_path(plan.directory, seed, "json").read_text())
             for seed in plan.seeds
         ]
-        spent = sum(fact["cpu_seconds"] for fact in facts)
+        spent = sum(fact.get("cpu_seconds", 0.0) for fact in facts)
         failed = sum(fact["status"] != "complete" for fact in facts)
         total += spent
-        peak = max(peak, *(fact["peak_memory_mib"] for fact in facts))
+        peak = max(peak, *(fact.get("peak_memory_mib", 0.0) for fact in facts))
         lines.append(
             f"{plan.env + ' ' + plan.name:32}{len(facts):7}{failed:8}"
             f"{spent / len(facts):14.2f}{spent / 60:10.1f}"
@@ -148,7 +151,7 @@ def closing_table(plans: Sequence[Plan], seconds: float) -> str:
     lines.append(f"{'in all':61}{total / 60:10.1f}")
     workers = plans[0].config["workers"]
     lines.append(
-        f"this call: {seconds / 60:.1f} min with {workers} worker(s); "
+        f"this call: {seconds / 60:.1f} min with workers={workers}; "
         f"peak memory of a process that trains: {peak:.0f} MiB"
     )
     return "\n".join(lines)

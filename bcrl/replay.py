@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -28,9 +29,9 @@ class Replay:
     """The last `capacity` transitions of each seed, and their targets' frozen parts.
 
     What base and shaping add to a target is fixed when a transition is stored, so it is
-    computed once and not for every batch that draws it. `bootstrap` (S, capacity, 2)
-    has room for a row's max_a' (ϱ + base)(s') by the target network and for the number
-    of the target's copy that it is by, −1 in a new row.
+    computed once and not for every batch that draws it. `bootstrap` (S, capacity) has
+    room for a row's max_a' (ϱ + base)(s') by the target network, `known` says which are
+    so: none in a new row, and none after `forget`.
     """
 
     def __init__(
@@ -42,7 +43,8 @@ class Replay:
         self.added = 0
         on_cpu = self.rows.device.type == "cpu"
         self._shared = self.rows.numpy() if on_cpu else None  # the same memory
-        self.bootstrap = np.full((n_seeds, capacity, 2), -1.0, np.float32)
+        self.bootstrap = np.zeros((n_seeds, capacity), np.float32)
+        self.known = np.zeros((n_seeds, capacity), np.bool_)
         self._row = np.empty((n_seeds, width), np.float32)
         self._first = torch.arange(n_seeds, device=device)[:, None] * capacity
 
@@ -61,20 +63,18 @@ class Replay:
         action: NDArray[np.intp],
     ) -> None:
         """Store one transition of every seed; shapes as in `Batch` without B."""
-        d, end, row = self.d, 2 * self.d + self.n_actions, self._row
-        row[:, :d], row[:, d : 2 * d], row[:, 2 * d : end] = (
-            state,
-            next_state,
-            next_base,
-        )
-        row[:, end], row[:, end + 1], row[:, end + 2] = fixed, discount, action
+        _pack(self._row, state, next_state, next_base, fixed, discount, action)
         at = self.added % self.capacity
         if self._shared is not None:
-            self._shared[:, at] = row
+            self._shared[:, at] = self._row
         else:
-            self.rows[:, at] = torch.from_numpy(row)
-        self.bootstrap[:, at, 1] = -1.0
+            self.rows[:, at] = torch.from_numpy(self._row)
+        self.known[:, at] = False
         self.added += 1
+
+    def forget(self) -> None:
+        """The target network has changed: no bootstrap value is known any longer."""
+        self.known[:] = False
 
     def places(self, u: NDArray[np.float64]) -> NDArray[np.int64]:
         """Which of a seed's rows uniforms u (T, S, B) pick in the next T steps.
@@ -99,3 +99,17 @@ class Replay:
             rows[..., end + 1],
             rows[..., end + 2 :].long(),
         )
+
+
+@numba.njit(cache=True)
+def _pack(rows, state, next_state, next_base, fixed, discount, action):
+    """One row of every seed: state, next state, next base, c, discount, action."""
+    d, n_actions = state.shape[1], next_base.shape[1]
+    for s in range(len(rows)):
+        row = rows[s]
+        for i in range(d):
+            row[i], row[d + i] = state[s, i], next_state[s, i]
+        for a in range(n_actions):
+            row[2 * d + a] = next_base[s, a]
+        end = 2 * d + n_actions
+        row[end], row[end + 1], row[end + 2] = fixed[s], discount[s], action[s]

@@ -163,7 +163,7 @@ def _walk(next_row, reward, absorbing, q, first, u, epsilon):
         for t in range(horizon):
             if u[t, e, 0] < epsilon:
                 act = int(u[t, e, 1] * n_actions)
-            else:  # greedy, ties broken uniformly, as policies.greedy does
+            else:  # as policies.greedy, whose code a cache of this file can't follow
                 best, ties = q[at, 0], 1
                 for a in range(1, n_actions):
                     if q[at, a] > best:

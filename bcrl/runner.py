@@ -11,6 +11,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ import numpy as np
 from bcrl import costs, oracle, records
 from bcrl.compose import Plan
 from bcrl.envs import Env
+from bcrl.errors import BcrlError
 from bcrl.evaluation import StepProbe
 from bcrl.probes import Probe
 from bcrl.progress import Job, Progress, Tick
@@ -32,6 +35,7 @@ def run(*plans: Plan) -> None:
     All of them share one pool of processes: jobs of a few seeds, the longest first.
     """
     began, options = time.perf_counter(), plans[0].config
+    plans = tuple(merged(plans))
     work = ordered(plans)
     if work:
         _search_references([plan for plan, _ in work])
@@ -39,7 +43,7 @@ def run(*plans: Plan) -> None:
         jobs = [_job(plan, seeds) for plan, seeds in work]
         progress = Progress(jobs, workers, options["progress"])
         try:
-            _train(work, workers, progress.tick)
+            _train(work, workers, options["threads"], progress.tick)
         finally:
             progress.close()
     if len(plans) > 1 and options["progress"] != "none":
@@ -47,35 +51,44 @@ def run(*plans: Plan) -> None:
         print(records.closing_table(plans, spent), file=sys.stderr)
 
 
+def merged(plans: Sequence[Plan]) -> Iterator[Plan]:
+    """The plans, those of one directory as one with the seeds of all."""
+    together: dict[Path, Plan] = {}
+    for plan in plans:
+        before = together.get(plan.directory, plan)
+        seeds = tuple(dict.fromkeys(before.seeds + plan.seeds))
+        together[plan.directory] = replace(before, seeds=seeds)
+    yield from together.values()
+
+
 def ordered(plans: Sequence[Plan]) -> list[tuple[Plan, Seeds]]:
     """The jobs that remain to be done, the one expected to be longest first."""
-    return sorted(
-        _pending(plans), key=lambda each: -len(each[1]) * costs.expected(each[0])
-    )
+    pending = [(plan, seeds) for plan in plans if (seeds := _pending(plan))]
+    workers = plans[0].config["workers"]
+    # With variants enough to go round, seeds that train together cost less each.
+    spread = 1 if len(pending) >= 2 * workers else workers
+    work = [
+        (plan, group)
+        for plan, seeds in pending
+        for group in _groups(seeds, plan.lockstep, spread)
+    ]
+    return sorted(work, key=lambda job: -len(job[1]) * costs.expected(job[0]))
 
 
-def _pending(plans: Sequence[Plan]) -> Iterator[tuple[Plan, Seeds]]:
-    """Groups of seeds that are to be trained, each seed of a directory once."""
-    taken: set[tuple[Path, int]] = set()
-    for plan in plans:
-        seeds = [
-            seed
-            for seed in records.open_directory(plan)
-            if (plan.directory, seed) not in taken
-        ]
-        taken |= {(plan.directory, seed) for seed in seeds}
-        skipped = len(plan.seeds) - len(seeds)
-        if skipped and plan.config["progress"] != "none":
-            said = f"{skipped} of {len(plan.seeds)} seeds complete"
-            print(f"{plan.env} {plan.name}: {said}", file=sys.stderr)
-        if seeds:
-            yield from ((plan, group) for group in _groups(plan, seeds))
+def _pending(plan: Plan) -> list[int]:
+    """The plan's seeds that are to be trained."""
+    seeds = records.pending(plan)
+    done = len(plan.seeds) - len(seeds)
+    if done and plan.config["progress"] != "none":
+        said = f"{done} of {len(plan.seeds)} seeds complete"
+        print(f"{plan.env} {plan.name}: {said}", file=sys.stderr)
+    return seeds
 
 
-def _groups(plan: Plan, seeds: list[int]) -> list[Seeds]:
-    """Seeds that train together: at most as allowed, spread evenly over the workers."""
-    workers = min(plan.config["workers"], len(seeds))
-    rounds = -(-len(seeds) // (plan.lockstep * workers))
+def _groups(seeds: list[int], lockstep: int, workers: int) -> list[Seeds]:
+    """Seeds that train together: at most `lockstep`, spread evenly over the workers."""
+    workers = min(workers, len(seeds))
+    rounds = -(-len(seeds) // (lockstep * workers))
     groups = min(rounds * workers, len(seeds))
     return [tuple(part.tolist()) for part in np.array_split(seeds, groups)]
 
@@ -103,13 +116,17 @@ def _job(plan: Plan, seeds: Seeds) -> Job:
 
 
 def _train(
-    work: Sequence[tuple[Plan, Seeds]], workers: int, tick: Callable[[Tick], None]
+    work: Sequence[tuple[Plan, Seeds]],
+    workers: int,
+    threads: int | None,
+    tick: Callable[[Tick], None],
 ) -> None:
-    threads = work[0][0].config["threads"] or max(1, _cores() // workers)
+    threads = threads or max(1, _cores() // workers)
     origin = records.provenance()  # of the code that starts, not of what it becomes
     if workers == 1:
         for number, (plan, seeds) in enumerate(work):
-            train_group(plan, seeds, threads, origin, number, tick)
+            train = partial(train_group, plan, seeds, threads, origin, number, tick)
+            _named(train, plan, seeds)
         return
     context = multiprocessing.get_context("spawn")
     with context.Manager() as manager:
@@ -125,7 +142,7 @@ def _train(
                 _drain(ticks, tick)
                 done, waiting = wait(waiting, timeout=0)
                 for job in done:
-                    job.result()
+                    _named(job.result, *work[jobs.index(job)])
             _drain(ticks, tick)
         except BaseException:  # a failure or Ctrl-C ends all workers at once
             pool.shutdown(wait=False, cancel_futures=True)
@@ -133,6 +150,17 @@ def _train(
                 worker.terminate()
             raise
         pool.shutdown()
+
+
+def _named(call: Callable[[], None], plan: Plan, seeds: Seeds) -> None:
+    """`call`, an unforeseen error of it preceded by a line that names the job."""
+    try:
+        call()
+    except BcrlError:
+        raise
+    except Exception:
+        print(f"{plan.env} {plan.name}, seeds {seeds}: failed", file=sys.stderr)
+        raise
 
 
 def _leave_interrupts() -> None:
@@ -170,6 +198,7 @@ def train_group(
     origin: which code and machine, as `records.provenance` says; job: the number that
     ticks are to bear.
     """
+    records.begin(plan)
     wall, cpu = time.perf_counter(), time.process_time()
     probe = _probe(plan, seeds)
     team = Team(seeds, probe.states, threads, plan.device)

@@ -34,13 +34,51 @@ RELEASED_OPTIONS = {
     ("boosting", "on"): "released",
     ("transfer", "shaping"): "shaping_released",
 }
-#: Hydra's keys that only matter in composing.
-COMPOSING = ("hydra.searchpath", "hydra.mode", "hydra.sweeper.params")
+#: Hydra's own keys that matter in running jobs.
+RUNNING = (
+    *("launcher", "callbacks", "output_subdir", "run", "sweep"),
+    *("job_logging", "hydra_logging", "verbose"),
+)
 Folders = tuple[str, ...]  # of configs, besides our own
 
 
 def plans(arguments: Namespace) -> list[Plan]:
     """The checked plan of each job that this command line asks for."""
+    folders, jobs = _composed(arguments)
+    planned = [plan(job, job.hydra.runtime.choices, folders) for job in jobs]
+    _refuse_collisions(planned)
+    return planned
+
+
+def left_to_hydra(arguments: Namespace) -> bool:
+    """Whether the jobs ask for more of Hydra than composing them.
+
+    Then Hydra runs them one by one, or hands them to a launcher. Raises BcrlError for a
+    sweep over experiments, which Hydra can't run.
+    """
+    usual = _running(_compose(CONFIG_NAME, ("env=maze",), ()))
+    for job in _composed(arguments)[1]:
+        asked = [k for k, value in _running(job).items() if value != usual[k]]
+        if asked and any(map(_sweeps_experiments, _parse(arguments.overrides))):
+            text = f"experiment: with hydra.{asked[0]} of your own, one at a time"
+            raise BcrlError(text)
+        if asked:
+            return True
+    return False
+
+
+def _running(composed: DictConfig) -> Plain:
+    """What Hydra's part of a config says of running jobs."""
+    hydra = OmegaConf.to_container(composed.hydra, resolve=False)
+    kept = {key: hydra.get(key) for key in RUNNING}
+    return kept | {
+        "sweeper": hydra["sweeper"]["_target_"],
+        "job": [hydra["job"].get(key) for key in ("chdir", "env_set")],
+    }
+
+
+def _composed(arguments: Namespace) -> tuple[Folders, list[DictConfig]]:
+    """The folders of configs besides ours, and each job composed."""
     name = arguments.config_name or CONFIG_NAME
     parsed = _parse(arguments.overrides)
     folders: Folders = ()
@@ -54,43 +92,33 @@ def plans(arguments: Namespace) -> list[Plan]:
     for override in searchpath:
         folders += _folders(override.value())
     _refuse_nonsense(parsed, folders, arguments)
-    planned = []
-    for overrides in _experiments(parsed, bool(arguments.multirun)):
-        for job in _jobs(name, overrides, bool(arguments.multirun), folders):
-            composed = _compose(name, tuple(job), folders)
-            planned.append(plan(composed, composed.hydra.runtime.choices, folders))
-    _refuse_collisions(planned)
-    return planned
+    multirun = bool(arguments.multirun)
+    return folders, [
+        _compose(name, tuple(job), folders)
+        for overrides in _experiments(parsed, multirun)
+        for job in _jobs(name, overrides, multirun, folders)
+    ]
 
 
-def left_to_hydra(arguments: Namespace) -> bool:
-    """Whether the command line asks for more of Hydra than composing its jobs.
-
-    Then Hydra runs them one by one, or hands them to a launcher. Raises BcrlError for a
-    sweep over experiments, which Hydra can't run.
-    """
-    parsed = _parse(arguments.overrides)
-    keys = [override.key_or_group for override in parsed]
-    asked = [k for k in keys if k.startswith("hydra") and not k.startswith(COMPOSING)]
-    if asked and any(
-        o.key_or_group == "experiment" and o.is_sweep_override() for o in parsed
-    ):
-        raise BcrlError(f"experiment: Hydra sweeps over one at a time; drop {asked[0]}")
-    return bool(asked)
+def _sweeps_experiments(override: Override) -> bool:
+    return override.key_or_group == "experiment" and override.is_sweep_override()
 
 
 def _experiments(overrides: list[Override], multirun: bool) -> Iterator[list[Override]]:
     """The overrides with each of the experiments that they sweep over."""
-    swept = [
-        o for o in overrides if o.key_or_group == "experiment" and o.is_sweep_override()
-    ]
-    if not swept:
+    chosen = [o for o in overrides if o.key_or_group == "experiment"]
+    if not chosen or not _sweeps_experiments(chosen[-1]):
         yield overrides
         return
     if not multirun:
         raise BcrlError("experiment: several values are a sweep; add -m")
-    rest = [o for o in overrides if o not in swept]
-    for name in swept[-1].sweep_string_iterator():
+    rest = [o for o in overrides if o not in chosen]
+    try:
+        names = list(chosen[-1].sweep_string_iterator())
+    except HydraException as error:
+        text = f"experiment={chosen[-1].value()}: list them, experiment=fig1,fig2"
+        raise BcrlError(text) from error
+    for name in names:
         yield _parse([f"experiment={name}"]) + rest
 
 

@@ -16,15 +16,21 @@ from bcrl.compose import Plan
 config.register()
 
 
-def plans(*overrides: str, multirun: bool = False, config_dir: str | None = None):
-    """The plans that `bcrl *overrides` would run."""
-    arguments = Namespace(
+def arguments(
+    *overrides: str, multirun: bool = False, config_dir: str | None = None
+) -> Namespace:
+    """What `bcrl *overrides` parses to."""
+    return Namespace(
         overrides=list(overrides),
         multirun=multirun,
         config_dir=config_dir,
         config_name=None,
     )
-    return vetting.plans(arguments)
+
+
+def plans(*overrides: str, **options) -> list[Plan]:
+    """The plans that `bcrl *overrides` would run; options as in `arguments`."""
+    return vetting.plans(arguments(*overrides, **options))
 
 
 def plan(*overrides: str) -> Plan:

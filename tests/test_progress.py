@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from bcrl import costs, runner
+from bcrl import costs, runner, vetting
 from bcrl.errors import BcrlError
 from bcrl.progress import SILENCE, TRUST, Job, Progress, Tick
-from tests.conftest import plans
+from tests.conftest import arguments, plan, plans
 
 FIGURES = ("experiment=fig1,fig2,fig4", "scale=paper", "workers=2")
 
@@ -23,16 +23,46 @@ def test_a_sweep_over_experiments_is_all_of_their_jobs():
     assert {p.directory for p in again} == {p.directory for p in again[:4]}
 
 
-def test_hydras_own_launchers_get_one_experiment_at_a_time(bcrl, tmp_path):
-    done = bcrl("-m", "experiment=fig1,fig2", "hydra.sweep.dir=x")
-    assert done.returncode == 2 and "one at a time" in done.stderr, done.stderr
-    assert not list(tmp_path.iterdir())
+def test_hydras_own_launchers_get_one_experiment_at_a_time():
+    given = arguments("experiment=fig1,fig2", "hydra.sweep.dir=x", multirun=True)
+    with pytest.raises(BcrlError, match="one at a time"):
+        vetting.left_to_hydra(given)
+
+
+def test_who_runs_the_jobs_is_read_from_the_composed_config(tmp_path):
+    assert not vetting.left_to_hydra(arguments("experiment=fig2", multirun=True))
+    assert vetting.left_to_hydra(arguments("env=maze", "+hydra.job.env_set.A=1"))
+    (tmp_path / "experiment").mkdir()
+    own = "# @package _global_\nhydra: {callbacks: {mine: {_target_: a.B}}}\n"
+    (tmp_path / "experiment/own.yaml").write_text(own)
+    given = arguments("env=maze", "experiment=own", config_dir=str(tmp_path))
+    assert vetting.left_to_hydra(given)
+
+
+def test_plans_in_one_pool_write_what_they_write_alone(tmp_path):
+    small = ("scale=smoke", "seeds.count=2", "progress=none")
+    maze = ("env=maze", "curriculum=on", "boosting=on", "algorithm.regressor.trees=3")
+    system = ("env=linear_system", "algorithm=dqn", "variant=BC")
+    for folder, workers in (("alone", 1), ("together", 2)):
+        out = (*small, f"runs_dir={tmp_path / folder}", f"workers={workers}")
+        both = [plan(*choice, *out) for choice in (maze, system)]
+        if workers == 2:
+            runner.run(*both)
+        else:
+            for each in both:
+                runner.run(each)
+    files = sorted((tmp_path / "alone").rglob("seed_*.*"))
+    files = [file for file in files if file.suffix in (".csv", ".npz")]
+    assert len(files) == 2 * 2 * 2
+    for file in files:
+        other = tmp_path / "together" / file.relative_to(tmp_path / "alone")
+        assert file.read_bytes() == other.read_bytes(), file
 
 
 def test_the_longest_jobs_come_first_and_each_seed_once(tmp_path):
     out = ("progress=none", f"runs_dir={tmp_path}")
     both = plans(*FIGURES[:1], "scale=quick", "workers=2", *out, multirun=True)
-    work = runner.ordered([*both, *both])
+    work = runner.ordered([*runner.merged([*both, *both])])
     expected = [len(seeds) * costs.expected(plan) for plan, seeds in work]
     assert expected == sorted(expected, reverse=True)
     seeds = [(plan.directory, seed) for plan, group in work for seed in group]
@@ -77,9 +107,25 @@ def test_the_closing_table_counts_every_run(bcrl, tmp_path):
         assert "peak memory" in done.stderr
 
 
-def test_an_unknown_experiment_among_several_is_named():
-    with pytest.raises(BcrlError, match="fig11"):
-        plans("experiment=fig1,fig11", multirun=True)
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("experiment=fig1,fig11", "fig11"),
+        ("experiment=glob(fig*)", "list them"),
+        ("experiment=interval(0,1)", "list them"),
+    ],
+)
+def test_experiments_that_cant_be_are_refused(given, said):
+    with pytest.raises(BcrlError, match=said):
+        plans(given, multirun=True)
+
+
+def test_the_directories_two_experiments_share_are_planned_once():
+    both = plans("experiment=fig2,fig3,fig5", "scale=smoke", multirun=True)
+    once = [*runner.merged(both)]
+    assert (len(both), len(once)) == (9, 4)
+    more = plans("env=maze", "seeds.count=1,3", multirun=True)
+    assert [p.seeds for p in runner.merged(more)] == [(0, 1, 2)]
 
 
 def test_a_line_is_due_after_a_while_of_silence(monkeypatch, capsys):

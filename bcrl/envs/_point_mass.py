@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numba
 
+from bcrl.arrays import per_lane
+
 DT = 0.05  # s, Euler step
 NOISE = 1e-5  # standard deviation of the noise on each component of the derivative
 PATHWAY = 0.5  # |y| beyond which the target task starts anew
@@ -99,19 +101,13 @@ def _moved(state, force, normal, d):
     return _motion(_choose, components, force, normal, (d[0], d[1], d[2], d[3], d[4]))
 
 
-@numba.guvectorize(
-    ["(f8[:], f8[:], f8[:], f8[:], f8[:])"], "(s),(k),(s),(c)->(s)", cache=True
-)
+@per_lane("(f8[:], f8[:], f8[:], f8[:], f8[:])", "(s),(k),(s),(c)->(s)")
 def motion_lanes(state, force, normal, dynamics, after):
     """`motion` on arrays: state (..., 4), force (..., 2), normal (..., 4)."""
     after[0], after[1], after[2], after[3] = _moved(state, force, normal, dynamics)
 
 
-@numba.guvectorize(
-    ["(f8[:], f8[:], f8[:], f8[:], f8[:], f8[:])"],
-    "(s),(k),(s),(c)->(s),()",
-    cache=True,
-)
+@per_lane("(f8[:], f8[:], f8[:], f8[:], f8[:], f8[:])", "(s),(k),(s),(c)->(s),()")
 def lq_lanes(state, force, normal, dynamics, after, reward):
     """The LQ task's next state and reward on arrays."""
     moved = _moved(state, force, normal, dynamics)
@@ -119,10 +115,9 @@ def lq_lanes(state, force, normal, dynamics, after, reward):
     reward[0] = _lq_reward(moved, force)
 
 
-@numba.guvectorize(
-    ["(f8[:], f8[:], f8[:], f8[:], f8[:], f8[:], f8[:], f8[:], b1[:])"],
+@per_lane(
+    "(f8[:], f8[:], f8[:], f8[:], f8[:], f8[:], f8[:], f8[:], b1[:])",
     "(s),(k),(s),(s),(s),(c)->(s),(),()",
-    cache=True,
 )
 def pathway_lanes(
     state, force, normal, uniform, spread, dynamics, after, reward, arrived

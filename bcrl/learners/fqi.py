@@ -70,7 +70,8 @@ class FQI:
             else [[None] * env.n_actions for _ in sets]
         )
         predict = functools.partial(_predict, self.regressor, team.threads)
-        evaluated = start.remembered()  # the next stage's base should not remember
+        # With noise no state comes twice; the next stage's base should not remember.
+        evaluated = start if env.step_noise else start.remembered()
         for k in range(1, self.iterations + 1):
             residual = [values.copy() for values in residual]
             fits = self._fit(stage, k, team, rewards, sets, base, residual)

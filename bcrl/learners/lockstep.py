@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bcrl.bellman import frozen_part, shaping
 from bcrl.learners.update import updater
-from bcrl.policies import combined, greedy, uniform
+from bcrl.policies import combined, epsilon_greedy, greedy
 from bcrl.q import Q
 from bcrl.q.mlp import Adam, DeepQ, Networks, xavier
 from bcrl.replay import Replay
@@ -154,9 +154,7 @@ class Lockstep:
 
         `reuse`: the lanes in which PPR may follow the prior.
         """
-        random = u[..., 0] < epsilon
-        drawn = uniform(self.env.n_actions, u[..., 1])
-        own = np.where(random, drawn, greedy(own_values, u[..., 1]))
+        own, random = epsilon_greedy(own_values, u[..., 0], u[..., 1], epsilon)
         steering = self.start.steering
         if isinstance(steering, PolicyReuse):
             follow = reuse & (u[..., 2] < steering.nu**step)
@@ -193,8 +191,12 @@ class Lockstep:
 
     def update(self, step: int) -> None:
         """One gradient step of every seed on a batch of its own."""
-        places = self._places[step % BLOCK]
-        loss, self._ahead = self._gradient_step(places, self.state)
+        at, target_update = step % BLOCK, self.settings.target_update
+        since = self.deep.steps % target_update
+        batches = 1 if at and since else target_update - since  # till the target's next
+        loss, self._ahead = self._gradient_step(
+            self._places[at : at + batches], self.state
+        )
         self.loss += loss
         self.updates += 1
 
@@ -203,6 +205,7 @@ class Lockstep:
         self.deep.steps += 1
         if self.deep.steps % self.settings.target_update == 0:
             self.deep.copy_target()
+            self.replay.forget()
 
     def moment(self, step: int) -> Moment:
         """What there is to see after `step` steps of the stage."""

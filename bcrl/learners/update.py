@@ -12,8 +12,9 @@ from bcrl.q import fused
 from bcrl.q.mlp import DeepQ, Networks
 from bcrl.replay import Replay
 
-#: (places (S, B), next states (S, d)) → losses (S,), and the network's values (S, A) at
-#: these states if they were cheap to have
+#: (places (T, S, B), next states (S, d)) → losses (S,), and the network's values (S, A)
+#: at these states if they were cheap to have. The update is on the first of the
+#: batches, the others are of steps to come before the target changes.
 Update = Callable[
     [NDArray[np.int64], NDArray[np.float64]],
     tuple[NDArray[np.float64], NDArray[np.float32] | None],
@@ -37,7 +38,7 @@ def batched(deep: DeepQ, replay: Replay) -> Update:
     gradient = Networks(online.sizes, torch.zeros_like(online.flat))
 
     def update(places: NDArray, states: NDArray) -> tuple[NDArray, None]:
-        batch = replay.sample(torch.from_numpy(places).to(online.flat.device))
+        batch = replay.sample(torch.from_numpy(places[0]).to(online.flat.device))
         next_values = target.forward(batch.next_state).add_(batch.next_base)
         y = torch.addcmul(batch.fixed, batch.discount, next_values.amax(-1))
         output = online.forward(batch.state)
@@ -60,20 +61,22 @@ def compiled(deep: DeepQ, replay: Replay) -> Update:
     sizes, layout = np.array(deep.online.sizes), (replay.d, replay.n_actions)
     rows = replay.rows.numpy()
 
+    kept = (rows, replay.bootstrap, replay.known)
+
     def update(places: NDArray, states: NDArray) -> tuple[NDArray, NDArray]:
         adam, loss = deep.optimiser.next_step(), np.empty(len(online))
         ahead = np.empty((len(online), replay.n_actions), np.float32)
+        if len(places) > 1:
+            fused.renew_ahead(target, sizes, *kept, replay.size, places, layout)
         fused.update(
             online,
             target,
             moments,
             sizes,
-            rows,
-            replay.bootstrap,
-            places,
+            *kept,
+            places[0],
             layout,
             adam,
-            deep.copies,
             states.astype(np.float32),
             loss,
             ahead,

@@ -15,8 +15,10 @@ import numpy as np
 import scipy.linalg.cython_blas  # noqa: F401, limits reach only what is loaded
 
 FADED = np.float32(1e-30)
+TOGETHER = 256  # rows that the target is asked about at a time, ahead of their use
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
-#: Without "nnan": a weight that is not a number stays one, and is found.
+#: For Adam's division and square root. An infinite weight may turn into one that is not
+#: a number ("ninf"), and that stays one (no "nnan"): either is found.
 _approximate = {"reassoc", "nsz", "arcp", "contract", "afn", "ninf"}
 
 
@@ -140,29 +142,57 @@ def adam(parameters, gradient, first, second, beta1, beta2, rate, scale, eps):
 
 
 @_compiled
-def renew(target, sizes, rows, kept, places, layout, copies, after, stale, work):
-    """Bring one seed's `kept` max_a' (ϱ + base)(s') at `places` up to date.
+def renew(target, sizes, rows, bootstrap, known, places, layout, after, stale, work):
+    """Make one seed's `bootstrap` max_a' (ϱ + base)(s') known at `places`.
 
-    kept (capacity, 2): the value and which copy of the target it is by; what is by
-    `copies` stays. after (B, d), stale (B,) and work are overwritten.
+    rows, bootstrap, known: the seed's part of `Replay`'s; after (n, d), stale (n,) and
+    work are overwritten: up to n rows at a time are asked for.
     """
     d, n_actions = layout
-    n = 0
-    for place in places:
-        if kept[place, 1] != copies:
-            kept[place, 1] = copies
+    n, last = 0, len(places) - 1
+    for i in range(len(places)):
+        place = places[i]
+        if not known[place]:
+            known[place] = True
             after[n] = rows[place, d : 2 * d]
             stale[n] = place
             n += 1
-    if n == 0:
-        return
-    values = forward(target, sizes, after[:n], work)
-    for i in range(n):
-        row = rows[stale[i]]
-        best = values[i, 0] + row[2 * d]
-        for a in range(1, n_actions):
-            best = max(best, values[i, a] + row[2 * d + a])
-        kept[stale[i], 0] = best
+        if n == len(stale) or (i == last and n > 0):
+            values = forward(target, sizes, after[:n], work)
+            for k in range(n):
+                row = rows[stale[k]]
+                best = values[k, 0] + row[2 * d]
+                for a in range(1, n_actions):
+                    best = max(best, values[k, a] + row[2 * d + a])
+                bootstrap[stale[k]] = best
+            n = 0
+
+
+@_compiled
+def renew_ahead(target, sizes, rows, bootstrap, known, held, places, layout):
+    """`renew` for S seeds, at all `places` (T, S, B) of batches to come.
+
+    In large products, and with a target's parameters loaded once. What is not among the
+    first `held` rows yet is left out.
+    """
+    n_seeds, d = len(target), layout[0]
+    work = np.empty(TOGETHER * sizes[1:].sum(), np.float32)
+    after, stale = np.empty((TOGETHER, d), np.float32), np.empty(TOGETHER, np.int64)
+    for s in range(n_seeds):
+        there = places[:, s].copy().reshape(-1)
+        there = there[there < held]
+        renew(
+            target[s],
+            sizes,
+            rows[s],
+            bootstrap[s],
+            known[s],
+            there,
+            layout,
+            after,
+            stale,
+            work,
+        )
 
 
 @_compiled
@@ -172,22 +202,21 @@ def update(
     moments,
     sizes,
     rows,
-    kept,
+    bootstrap,
+    known,
     places,
     layout,
     constants,
-    copies,
     states,
     loss,
     ahead,
 ):
     """One DQN update of S seeds, in place; each one's mean loss goes to `loss` (S,).
 
-    online, target (S, P); moments (2, S, P); rows (S, capacity, width) and kept
-    (S, capacity, 2) of `Replay`; places (S, B) rows of each seed's own; layout: d and
-    A; constants: Adam's; copies: how often the target was copied. While its parameters
-    are in the cache, each network is asked at the state that comes next, states (S, d):
-    `ahead` (S, A).
+    online, target (S, P); moments (2, S, P); rows (S, capacity, width), bootstrap and
+    known (S, capacity) of `Replay`; places (S, B) rows of each seed's own; layout: d
+    and A; constants: Adam's. While its parameters are in the cache, each network is
+    asked at the state that comes next, states (S, d): `ahead` (S, A).
     """
     d, n_actions = layout
     beta1, beta2, rate, scale, eps = constants
@@ -199,12 +228,10 @@ def update(
     x, after = np.empty((n, d), np.float32), np.empty((n, d), np.float32)
     stale, one = np.empty(n, np.int64), np.float32(1.0)
     slope = np.empty((n, n_actions), np.float32)
-    end, copy = 2 * d + n_actions, np.float32(copies)
+    end = 2 * d + n_actions
     for s in range(n_seeds):
-        held, next_value, drawn = rows[s], kept[s], places[s]
-        renew(
-            target[s], sizes, held, next_value, drawn, layout, copy, after, stale, work
-        )
+        held, value, fresh, drawn = rows[s], bootstrap[s], known[s], places[s]
+        renew(target[s], sizes, held, value, fresh, drawn, layout, after, stale, work)
         for b in range(n):
             x[b] = held[drawn[b], :d]
         values = forward(online[s], sizes, x, work)
@@ -213,7 +240,7 @@ def update(
         for b in range(n):
             row = held[drawn[b]]
             a = int(row[end + 2])
-            y = row[end] + row[end + 1] * next_value[drawn[b], 0]
+            y = row[end] + row[end + 1] * value[drawn[b]]
             error = values[b, a] - y
             clipped = one if error > one else -one if error < -one else error  # or nan
             slope[b, a] = clipped / np.float32(n)

@@ -150,7 +150,6 @@ class DeepQ:
     target: Networks
     optimiser: Adam
     steps: int = 0  # environment steps since the networks were new
-    copies: int = 0  # how often the target became the online network since then
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         if isinstance(states, np.ndarray):
@@ -177,10 +176,8 @@ class DeepQ:
             self.target.clone(),
             self.optimiser.clone(),
             self.steps,
-            self.copies,
         )
 
     def copy_target(self) -> None:
         """The target becomes the online network."""
         self.target.flat.copy_(self.online.flat)
-        self.copies += 1

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.arrays import per_lane
 from bcrl.q import Values
 
 #: products: all z_i z_j, i ≤ j [released]; linear_quadratic: the z_i besides [paper].
@@ -60,11 +60,7 @@ class Quadratic:
         return [_values(x, *(part[s] for part in parts)) for s, x in enumerate(states)]
 
 
-@numba.guvectorize(
-    ["(f8[:,:], f8[:,:], f8[:,:], f8[:], f8[:,:])"],
-    "(n,d),(d,d),(d,a),(a)->(n,a)",
-    cache=True,
-)
+@per_lane("(f8[:,:], f8[:,:], f8[:,:], f8[:], f8[:,:])", "(n,d),(d,d),(d,a),(a)->(n,a)")
 def _values(states, pure, cross, alone, values):
     """xᵀ P x + x·C + c at states x (…, n, d)."""
     n, d = states.shape
