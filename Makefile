@@ -52,7 +52,7 @@ bench: $(READY) ## speed, as ratios against the plain way in one run
 bench-peer: $(READY) ## the same against MushroomRL 1.10.2, in an environment of its own
 	test -x .venv-peer/bin/python || $(PYTHON) -m venv .venv-peer
 	.venv-peer/bin/python -m pip install --quiet --constraint constraints.txt --editable .
-	.venv-peer/bin/python -m pip install --quiet pygame opencv-python-headless
+	.venv-peer/bin/python -m pip install --quiet pygame==2.6.1 opencv-python-headless==5.0.0.93
 	.venv-peer/bin/python -m pip install --quiet --no-deps mushroom-rl==1.10.2
 	.venv-peer/bin/python bench/peer.py
 

@@ -10,8 +10,6 @@ from pathlib import Path
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
@@ -21,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from bcrl import compose
 from bcrl.compose import Plain, Plan
 from bcrl.errors import BcrlError, did_you_mean
+from bcrl.sweeps import experiments, first_lines, over_experiments, parse, product
 
 PACKAGE = Path(__file__).resolve().parent
 #: In a wheel the configs lie inside the package, in a checkout beside it.
@@ -59,7 +58,7 @@ def left_to_hydra(arguments: Namespace) -> bool:
     usual = _running(_compose(CONFIG_NAME, ("env=maze",), ()))
     for job in _composed(arguments)[1]:
         asked = [k for k, value in _running(job).items() if value != usual[k]]
-        if asked and any(map(_sweeps_experiments, _parse(arguments.overrides))):
+        if asked and any(map(over_experiments, parse(arguments.overrides))):
             text = f"experiment: with hydra.{asked[0]} of your own, one at a time"
             raise BcrlError(text)
         if asked:
@@ -80,7 +79,7 @@ def _running(composed: DictConfig) -> Plain:
 def _composed(arguments: Namespace) -> tuple[Folders, list[DictConfig]]:
     """The folders of configs besides ours, and each job composed."""
     name = arguments.config_name or CONFIG_NAME
-    parsed = _parse(arguments.overrides)
+    parsed = parse(arguments.overrides)
     folders: Folders = ()
     if arguments.config_dir:
         folder = Path(arguments.config_dir).absolute()
@@ -95,31 +94,9 @@ def _composed(arguments: Namespace) -> tuple[Folders, list[DictConfig]]:
     multirun = bool(arguments.multirun)
     return folders, [
         _compose(name, tuple(job), folders)
-        for overrides in _experiments(parsed, multirun)
+        for overrides in experiments(parsed, multirun)
         for job in _jobs(name, overrides, multirun, folders)
     ]
-
-
-def _sweeps_experiments(override: Override) -> bool:
-    return override.key_or_group == "experiment" and override.is_sweep_override()
-
-
-def _experiments(overrides: list[Override], multirun: bool) -> Iterator[list[Override]]:
-    """The overrides with each of the experiments that they sweep over."""
-    chosen = [o for o in overrides if o.key_or_group == "experiment"]
-    if not chosen or not _sweeps_experiments(chosen[-1]):
-        yield overrides
-        return
-    if not multirun:
-        raise BcrlError("experiment: several values are a sweep; add -m")
-    rest = [o for o in overrides if o not in chosen]
-    try:
-        names = list(chosen[-1].sweep_string_iterator())
-    except HydraException as error:
-        text = f"experiment={chosen[-1].value()}: list them, experiment=fig1,fig2"
-        raise BcrlError(text) from error
-    for name in names:
-        yield _parse([f"experiment={name}"]) + rest
 
 
 def _folders(searchpath: object) -> Folders:
@@ -203,24 +180,14 @@ def _plain(composed: DictConfig) -> Plain:
     try:
         return OmegaConf.to_container(job, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
-        raise BcrlError(_first_lines(error)) from error
-
-
-def _parse(overrides: Sequence[str]) -> list[Override]:
-    parser, parsed = OverridesParser.create(), []
-    for override in overrides:
-        try:
-            parsed += parser.parse_overrides([override])
-        except HydraException as error:
-            raise BcrlError(f"{override!r} can't be read as KEY=VALUE") from error
-    return parsed
+        raise BcrlError(first_lines(error)) from error
 
 
 def _jobs(
     name: str, overrides: list[Override], multirun: bool, folders: Folders
 ) -> list[list[str]]:
     """Each job's overrides: the product of what the command line and config sweep."""
-    jobs = _product(overrides)
+    jobs = product(overrides)
     first = _compose(name, tuple(jobs[0]), folders).hydra
     if not multirun and first.mode != RunMode.MULTIRUN:
         swept = [o.key_or_group for o in overrides if o.is_sweep_override()]
@@ -228,14 +195,7 @@ def _jobs(
             raise BcrlError(f"{swept[0]}: several values are a sweep; add -m")
         return jobs
     params = [f"{k}={v}" for k, v in (first.sweeper.get("params") or {}).items()]
-    return _product(_parse(params) + overrides)
-
-
-def _product(overrides: list[Override]) -> list[list[str]]:
-    try:
-        return BasicSweeper.split_arguments(overrides, None)[0]
-    except HydraException as error:
-        raise BcrlError(_first_lines(error)) from error
+    return product(parse(params) + overrides)
 
 
 def _refuse_collisions(planned: Sequence[Plan]) -> None:
@@ -261,12 +221,12 @@ def _compose(name: str, overrides: tuple[str, ...], folders: Folders) -> DictCon
         except MissingConfigException as error:
             raise BcrlError(_missing(error)) from error
         except (HydraException, OmegaConfBaseException) as error:
-            message = _first_lines(error)
+            message = first_lines(error)
         except Exception as error:  # e.g. YAML's own; composing runs nothing of ours
             hint = "; quote on and off, YAML takes them for booleans" * (
                 "in defaults : bool" in str(error)
             )
-            text = f"the configs can't be read: {_first_lines(error)}{hint}"
+            text = f"the configs can't be read: {first_lines(error)}{hint}"
             raise BcrlError(text) from error
         unknown = re.match(r"Could not override '([^']+)'", message)
         if unknown:
@@ -280,7 +240,7 @@ def _missing(error: MissingConfigException) -> str:
     wanted = error.missing_cfg_file or ""
     group, _, option = wanted.rpartition("/")
     if not group or error.options is None:
-        return _first_lines(error)
+        return first_lines(error)
     return f"{group}={option}: {did_you_mean(option, error.options)}"
 
 
@@ -297,15 +257,3 @@ def _known_keys(
         flat = compose.flat(OmegaConf.to_container(composed))
         return did_you_mean(key, flat)
     return "see bcrl --help"
-
-
-def _first_lines(error: BaseException) -> str:
-    """An error's own words, without the key and type listing that OmegaConf appends."""
-    lines = str(error).strip().splitlines()
-    listing = r"\s*(full_key|reference_type|object_type)"
-    text = " ".join(x.strip() for x in lines if not re.match(listing, x))
-    if error.__cause__ is not None and text.startswith("Error merging"):
-        return f"{text.split()[-1]}: {_first_lines(error.__cause__)}"
-    key = next((x.split(":", 1)[1].strip() for x in lines if "full_key" in x), "")
-    text = text or type(error).__name__
-    return text if not key or key in text else f"{key}: {text}"
