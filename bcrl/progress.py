@@ -13,7 +13,7 @@ from tqdm import tqdm
 LINE_EVERY = 0.1  # share of the work between two lines, where no job ends
 SILENCE = 30.0  # seconds after which a line is due anyhow
 REFRESH = 0.5  # seconds between two estimates in a bar
-TRUST = 20.0  # seconds of work that the estimates weigh against what is measured
+TRUST = 100.0  # seconds of work that the estimates weigh against what is measured
 
 
 @dataclass(frozen=True)
