@@ -48,6 +48,8 @@ bench: $(READY) ## speed, as ratios against the plain way in one run
 	$(BIN)/python bench/iteration.py
 	$(BIN)/python bench/growth.py
 	$(BIN)/python bench/dqn.py
+	$(BIN)/python bench/methods.py
+	test ! -d runs/paper || $(BIN)/python bench/paper.py
 
 bench-peer: $(READY) ## the same against MushroomRL 1.10.2, in an environment of its own
 	test -x .venv-peer/bin/python || $(PYTHON) -m venv .venv-peer
