@@ -126,23 +126,25 @@ def _train(
     if workers == 1:
         for number, (plan, seeds) in enumerate(work):
             train = partial(train_group, plan, seeds, threads, origin, number, tick)
-            _named(train, plan, seeds)
+            _blamed(train, plan, seeds)
         return
     context = multiprocessing.get_context("spawn")
     with context.Manager() as manager:
         ticks = manager.Queue()
         pool = ProcessPoolExecutor(workers, context, initializer=_leave_interrupts)
         try:
-            jobs = [
-                pool.submit(train_group, *each, threads, origin, number, ticks.put)
+            jobs = {
+                pool.submit(
+                    train_group, *each, threads, origin, number, ticks.put
+                ): each
                 for number, each in enumerate(work)
-            ]
+            }
             waiting = set(jobs)
             while waiting:
                 _drain(ticks, tick)
                 done, waiting = wait(waiting, timeout=0)
                 for job in done:
-                    _named(job.result, *work[jobs.index(job)])
+                    _blamed(job.result, *jobs[job])
             _drain(ticks, tick)
         except BaseException:  # a failure or Ctrl-C ends all workers at once
             pool.shutdown(wait=False, cancel_futures=True)
@@ -152,7 +154,7 @@ def _train(
         pool.shutdown()
 
 
-def _named(call: Callable[[], None], plan: Plan, seeds: Seeds) -> None:
+def _blamed(call: Callable[[], None], plan: Plan, seeds: Seeds) -> None:
     """`call`, an unforeseen error of it preceded by a line that names the job."""
     try:
         call()

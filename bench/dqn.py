@@ -27,14 +27,18 @@ from bcrl.transfer import Start
 ENV, STEPS, FILL = LinearSystem(), 1000, 600
 
 
+def perceptron(n_in: int, n_out: int) -> torch.nn.Sequential:
+    """The paper's network in plain torch: two hidden layers of 128."""
+    layers = []
+    for before, after in itertools.pairwise((n_in, 128, 128, n_out)):
+        layers += [torch.nn.Linear(before, after), torch.nn.ReLU()]
+    return torch.nn.Sequential(*layers[:-1])
+
+
 def plain() -> Iterator[None]:
     """One seed, a step at each `next`."""
     rng = np.random.default_rng(0)
-    widths = (4, 128, 128, 8)
-    layers = []
-    for n_in, n_out in itertools.pairwise(widths):
-        layers += [torch.nn.Linear(n_in, n_out), torch.nn.ReLU()]
-    online = torch.nn.Sequential(*layers[:-1])
+    online = perceptron(4, 8)
     target = copy.deepcopy(online)
     adam = torch.optim.Adam(online.parameters(), 1e-4)
     replay = [np.zeros((10_000, n), np.float32) for n in (4, 4, 1, 1, 1)]

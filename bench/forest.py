@@ -6,17 +6,15 @@ of 50 trees for each of 4 actions, at most 441 distinct rows in each, 441 query 
 The maze stands in two lines: scikit-learn has no multiplicities, so that it fits all
 rows in both; its user may predict at the 441 distinct successors only, as we do, or
 at all 100 000 as they come.
-Both sides are timed by turns and equally often, each time the best of several.
+Both sides are timed by turns and equally often, CPU time, the least of several.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-
 import numpy as np
 from sklearn.ensemble import ExtraTreesRegressor
 from threadpoolctl import threadpool_limits
+from timing import by_turns
 
 from bcrl.q.forest import Regression, TreeSettings, fit_forests
 
@@ -44,17 +42,6 @@ def hill(n: int, key: int) -> tuple[np.ndarray, np.ndarray]:
     return x, y + rng.normal(0, 0.02, n)
 
 
-def by_turns(functions: list[Callable[[], object]], repeats: int) -> list[float]:
-    """The least time of each in seconds, none of them timed in a row."""
-    best = [np.inf] * len(functions)
-    for _ in range(repeats):
-        for i, function in enumerate(functions):
-            started = time.perf_counter()
-            function()
-            best[i] = min(best[i], time.perf_counter() - started)
-    return best
-
-
 def main() -> None:
     x, y = hill(29_000, 0)
     queries, _ = hill(58_000, 1)
@@ -70,7 +57,7 @@ def main() -> None:
             lambda: forest.predict(queries),
             lambda: fit_forests([carried], PAPER, keep=False),
         ],
-        repeats=5,
+        turns=5,
     )
 
     rng = np.random.default_rng(2)
@@ -101,7 +88,7 @@ def main() -> None:
         fit_forests(distinct, PAPER, keep=False)
 
     distinct_time, all_time, mine_maze = by_turns(
-        [scikit_learn_distinct, scikit_learn_all, ours_maze], repeats=5
+        [scikit_learn_distinct, scikit_learn_all, ours_maze], turns=5
     )
 
     print(f"{'per tree, one core':38}{'scikit-learn':>14}{'ours':>12}{'ratio':>8}")

@@ -10,12 +10,11 @@ update. By turns, CPU time, the least of several.
 
 from __future__ import annotations
 
-import itertools
-import time
 from collections.abc import Callable
 
 import numpy as np
 import torch
+from dqn import STEPS, lockstep, perceptron
 from mushroom_rl.algorithms.value.batch_td.fqi import FQI as TheirFQI
 from mushroom_rl.algorithms.value.dqn.dqn import DQN as TheirDQN
 from mushroom_rl.approximators.parametric import TorchApproximator
@@ -26,16 +25,16 @@ from mushroom_rl.utils import spaces
 from mushroom_rl.utils.parameters import Parameter
 from sklearn.ensemble import ExtraTreesRegressor
 from threadpoolctl import threadpool_limits
+from timing import by_turns
 
 from bcrl.envs.car_on_hill import CarOnHill
 from bcrl.envs.linear_system import LinearSystem
-from bcrl.learners.dqn import DQN
 from bcrl.learners.fqi import FQI
 from bcrl.probes import probed_states
 from bcrl.q.regressors import ForestRegressor
 from bcrl.stage import Stage, Team, learn
 
-EPISODES, EARLY, STEPS = 1000, 6, 1000
+EPISODES, EARLY = 1000, 6
 
 
 class Wrapped(Environment):
@@ -64,11 +63,7 @@ class Network(torch.nn.Module):
 
     def __init__(self, input_shape, output_shape, **_) -> None:
         super().__init__()
-        widths = (input_shape[0], 128, 128, output_shape[0])
-        layers = []
-        for n_in, n_out in itertools.pairwise(widths):
-            layers += [torch.nn.Linear(n_in, n_out), torch.nn.ReLU()]
-        self.layers = torch.nn.Sequential(*layers[:-1])
+        self.layers = perceptron(input_shape[0], output_shape[0])
 
     def forward(self, state, action=None):
         values = self.layers(state.float())
@@ -134,21 +129,9 @@ def their_dqn() -> Callable[[], object]:
 
 
 def our_dqn(seeds: int) -> Callable[[], object]:
-    stage = Stage(1, 1, LinearSystem(), DQN(10**9, evaluate_every=STEPS), (), 0)
-    run = learn([stage], Team(tuple(range(seeds)), np.zeros((1, 4))))
+    run = lockstep(seeds)
     next(run), next(run)  # filled, compiled, updating
     return lambda: next(run)
-
-
-def by_turns(calls: list[Callable[[], object]], turns: int) -> list[float]:
-    """The least CPU seconds of a call of each."""
-    best = [np.inf] * len(calls)
-    for _ in range(turns):
-        for i, call in enumerate(calls):
-            began = time.process_time()
-            call()
-            best[i] = min(best[i], time.process_time() - began)
-    return best
 
 
 def main() -> None:

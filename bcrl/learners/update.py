@@ -59,9 +59,7 @@ def compiled(deep: DeepQ, replay: Replay) -> Update:
     buffers = (deep.online.flat, deep.target.flat, deep.optimiser.moments)
     online, target, moments = (buffer.numpy() for buffer in buffers)
     sizes, layout = np.array(deep.online.sizes), (replay.d, replay.n_actions)
-    rows = replay.rows.numpy()
-
-    kept = (rows, replay.bootstrap, replay.known)
+    kept = (replay.rows.numpy(), replay.bootstrap, replay.known)
 
     def update(places: NDArray, states: NDArray) -> tuple[NDArray, NDArray]:
         adam, loss = deep.optimiser.next_step(), np.empty(len(online))
