@@ -45,7 +45,7 @@ class Replay:
         self._shared = self.rows.numpy() if on_cpu else None  # the same memory
         self.bootstrap = np.zeros((n_seeds, capacity), np.float32)
         self.known = np.zeros((n_seeds, capacity), np.bool_)
-        self._row = np.empty((n_seeds, width), np.float32)
+        self._row = np.empty((n_seeds, 1, width), np.float32)
         self._first = torch.arange(n_seeds, device=device)[:, None] * capacity
 
     @property
@@ -63,12 +63,13 @@ class Replay:
         action: NDArray[np.intp],
     ) -> None:
         """Store one transition of every seed; shapes as in `Batch` without B."""
-        _pack(self._row, state, next_state, next_base, fixed, discount, action)
         at = self.added % self.capacity
+        parts = (state, next_state, next_base, fixed, discount, action)
         if self._shared is not None:
-            self._shared[:, at] = self._row
+            _pack(self._shared, at, *parts)
         else:
-            self.rows[:, at] = torch.from_numpy(self._row)
+            _pack(self._row, 0, *parts)
+            self.rows[:, at] = torch.from_numpy(self._row[:, 0])
         self.known[:, at] = False
         self.added += 1
 
@@ -102,11 +103,11 @@ class Replay:
 
 
 @numba.njit(cache=True)
-def _pack(rows, state, next_state, next_base, fixed, discount, action):
-    """One row of every seed: state, next state, next base, c, discount, action."""
+def _pack(rows, at, state, next_state, next_base, fixed, discount, action):
+    """Row `at` of every seed: state, next state, next base, c, discount, action."""
     d, n_actions = state.shape[1], next_base.shape[1]
     for s in range(len(rows)):
-        row = rows[s]
+        row = rows[s, at]
         for i in range(d):
             row[i], row[d + i] = state[s, i], next_state[s, i]
         for a in range(n_actions):

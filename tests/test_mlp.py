@@ -7,18 +7,19 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch
+from numba import njit
 from threadpoolctl import threadpool_limits
 from torch.nn import functional
 
-from bcrl.learners.update import batched, compiled, updater
-from bcrl.q import fused
+from bcrl.learners.update import batched, one_by_one, updater
+from bcrl.q import compiled, tiles
 from bcrl.q.mlp import Adam, DeepQ, Networks, xavier
 from bcrl.replay import Replay
 from bcrl.streams import stream
 
 D, A, BATCH = 4, 8, 32
-HIDDEN = pytest.mark.parametrize("hidden", [(128, 128), (64,), (32, 16, 8)])
-WAYS = pytest.mark.parametrize("way", [batched, compiled])
+HIDDEN = pytest.mark.parametrize("hidden", [(128, 128), (64,), (33, 20, 7)])
+WAYS = pytest.mark.parametrize("way", [batched, one_by_one])
 
 
 @pytest.fixture(autouse=True)
@@ -62,8 +63,8 @@ def filled(seeds, n=200, capacity=200):
     return replay
 
 
-def places(seeds, steps, n=200):
-    picked = [stream(s, "replay").integers(n, size=(steps, BATCH)) for s in seeds]
+def places(seeds, steps, n=200, batch=BATCH):
+    picked = [stream(s, "replay").integers(n, size=(steps, batch)) for s in seeds]
     return np.stack(picked, 1)
 
 
@@ -166,7 +167,7 @@ def test_the_stacked_forward_pass_is_torchs(hidden):
         expected = module(many, s)(x[s])
         assert torch.allclose(many.forward(x)[s], expected, atol=1e-5)
         sizes = np.array(many.sizes)
-        found = fused.outputs(many.flat.numpy(), sizes, x.numpy())[s]
+        found = compiled.outputs(many.flat.numpy(), sizes, x.numpy())[s]
         assert np.allclose(found, expected.detach(), atol=1e-5)
 
 
@@ -174,12 +175,13 @@ def _generator():
     return torch.Generator().manual_seed(0)
 
 
+@pytest.mark.parametrize("batch", [BATCH, 19, 70])
 @HIDDEN
-def test_both_ways_agree_over_fifty_steps(hidden):
+def test_both_ways_agree_over_fifty_steps(hidden, batch):
     seeds = (0, 1, 2)
-    replay, at = filled(seeds), places(seeds, 50)
+    replay, at = filled(seeds), places(seeds, 50, batch=batch)
     one, other = learner(hidden, seeds, 1e-3), learner(hidden, seeds, 1e-3)
-    ways = batched(one, replay), compiled(other, replay)
+    ways = batched(one, replay), one_by_one(other, replay)
     began = one.online.flat.clone()
     for step in range(50):
         losses = [losses_of(way, at[step]) for way in ways]
@@ -211,14 +213,14 @@ def test_stacking_changes_no_bit(way, hidden):
 @HIDDEN
 def test_the_compiled_update_looks_ahead_with_the_new_parameters(hidden):
     deep, replay, at = learner(hidden, (0, 1)), filled((0, 1)), places((0, 1), 1)
-    _, ahead = compiled(deep, replay)(at, NEXT[:2])
+    _, ahead = one_by_one(deep, replay)(at, NEXT[:2])
     assert np.array_equal(ahead, deep(NEXT[:2, None], A)[:, 0])
 
 
 def test_on_a_cpu_the_update_is_compiled(monkeypatch):
     deep, replay = learner((16,), (0,)), filled((0,))
     called = []
-    monkeypatch.setattr(fused, "update", lambda *given: called.append(len(given)))
+    monkeypatch.setattr(compiled, "update", lambda *given: called.append(len(given)))
     losses_of(updater(deep, replay), places((0,), 1)[0])
     assert called
 
@@ -248,7 +250,7 @@ def test_gradients_do_not_leak_where_the_unit_is_off():
     deep, replay = learner((16,), (0,)), filled((0,))
     deep.online.layers[0][0][:] = 0.0
     deep.online.layers[0][1][:] = -1.0
-    for way in (batched, compiled):
+    for way in (batched, one_by_one):
         copy = deep.clone()
         losses_of(way(copy, replay), places((0,), 1)[0])
         (w1, b1), (w2, b2) = Networks(
@@ -257,22 +259,33 @@ def test_gradients_do_not_leak_where_the_unit_is_off():
         assert not w1.any() and not b1.any() and not w2.any() and b2.any()
 
 
+@njit
+def adam(to, gradient):
+    """A step of Adam on arrays (1, n): the gradient is a product of one term."""
+    one, only = np.ones(1, np.float32), np.zeros(1, np.int64)
+    n = to[0].shape[1]
+    tiles.product_adam(to, n, only, 1, only, 1, one, 0, 0, gradient)
+
+
 def test_faded_moments_become_zero_and_not_denormal():
-    smallest = np.finfo(np.float32).tiny
+    smallest, n = np.finfo(np.float32).tiny, 50
     rng = np.random.default_rng(0)
-    parameters = rng.standard_normal(50).astype(np.float32)
-    first, second = np.zeros(50, np.float32), np.zeros(50, np.float32)
-    optimiser = Adam(torch.zeros(1, 50), 1e-4)
-    exact = [parameters.astype(float), np.zeros(50), np.zeros(50)]
-    gradient = (10.0 ** rng.uniform(-14, 0, 50)).astype(np.float32)
-    nothing = np.zeros(50, np.float32)
+    parameters = rng.standard_normal((1, n)).astype(np.float32)
+    first, second = np.zeros((2, 1, n), np.float32)
+    optimiser = Adam(torch.zeros(1, n), 1e-4)
+    exact = [parameters.astype(float), np.zeros((1, n)), np.zeros((1, n))]
+    gradient = np.zeros((1, 64), np.float32)  # tiles read beyond n
+    gradient[:, :n] = 10.0 ** rng.uniform(-14, 0, n)
+    nothing = np.zeros_like(gradient)
     for step in range(1, 3001):
         now = gradient if step <= 3 else nothing
-        fused.adam(parameters, now, first, second, *optimiser.next_step())
+        beta1, beta2, *others = optimiser.next_step()
+        constants = (beta1, 1 - beta1, beta2, 1 - beta2, *others)
+        adam((parameters, first, second, *constants), now)
         for moment in (first, second):
             assert not ((moment != 0) & (np.abs(moment) < smallest)).any()
-        exact[1] = 0.9 * exact[1] + 0.1 * now
-        exact[2] = 0.999 * exact[2] + 0.001 * now.astype(float) ** 2
+        exact[1] = 0.9 * exact[1] + 0.1 * now[:, :n]
+        exact[2] = 0.999 * exact[2] + 0.001 * now[:, :n].astype(float) ** 2
         scaled = exact[1] / (1.0 - 0.9**step)
         spread = np.sqrt(exact[2] / (1.0 - 0.999**step))
         exact[0] = exact[0] - 1e-4 * scaled / (spread + 1e-8)
@@ -294,13 +307,13 @@ def test_a_deep_q_answers_stacked_and_listed_states_alike():
 
 def test_a_clone_trains_on_its_own():
     deep, replay = learner((16,), (0, 1)), filled((0, 1))
-    losses_of(compiled(deep, replay), places((0, 1), 1)[0])
+    losses_of(one_by_one(deep, replay), places((0, 1), 1)[0])
     deep.steps = 7
     copy = deep.clone()
     kept = deepcopy((deep.online.flat, deep.target.flat, deep.optimiser.moments))
     assert (copy.steps, copy.optimiser.steps) == (7, 1)
     assert torch.equal(copy.optimiser.moments, kept[2])
-    losses_of(compiled(copy, replay), places((0, 1), 1)[0])
+    losses_of(one_by_one(copy, replay), places((0, 1), 1)[0])
     copy.target.flat.zero_()
     now = deep.online.flat, deep.target.flat, deep.optimiser.moments
     assert all(torch.equal(a, b) for a, b in zip(now, kept, strict=True))

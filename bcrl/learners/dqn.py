@@ -55,7 +55,7 @@ class DQN:
 
     def learn(self, stage: Stage, start: Start, team: Team) -> Iterator[Moment]:
         """Learn a stage; yields before the first step and every `evaluate_every`."""
-        with threadpool_limits(1):  # products this small are slower on more
+        with threadpool_limits(1):  # what there is for BLAS is too little for more
             run = Lockstep(self, stage, start, team)
             for step in range(self.length):
                 trained = step - self.random_steps

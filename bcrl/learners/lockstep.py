@@ -96,7 +96,8 @@ class Lockstep:
         prior = self.known[id(start.prior)]
         epsilon = self.settings.epsilon_at(step)
         own, action = self._decide(own_values, prior, u, epsilon, step)
-        self.decisions += u[:, 0] >= epsilon
+        if self.table is not None:
+            self.decisions += u[:, 0] >= epsilon
         noise = u[:, CHOICES : CHOICES + env.step_noise]
         after, reward, absorbing = env.step(self.state, action, noise)
         known = self._known(after)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bcrl.q import fused
+from bcrl.q import compiled
 from bcrl.q.mlp import DeepQ, Networks
 from bcrl.replay import Replay
 
@@ -28,7 +28,7 @@ def updater(deep: DeepQ, replay: Replay) -> Update:
     (tests/test_mlp.py), and no seed's result depends on the others.
     """
     if deep.online.flat.device.type == "cpu":
-        return compiled(deep, replay)
+        return one_by_one(deep, replay)
     return batched(deep, replay)
 
 
@@ -54,7 +54,7 @@ def batched(deep: DeepQ, replay: Replay) -> Update:
     return update
 
 
-def compiled(deep: DeepQ, replay: Replay) -> Update:
+def one_by_one(deep: DeepQ, replay: Replay) -> Update:
     """One seed after the other in compiled code."""
     buffers = (deep.online.flat, deep.target.flat, deep.optimiser.moments)
     online, target, moments = (buffer.numpy() for buffer in buffers)
@@ -65,8 +65,8 @@ def compiled(deep: DeepQ, replay: Replay) -> Update:
         adam, loss = deep.optimiser.next_step(), np.empty(len(online))
         ahead = np.empty((len(online), replay.n_actions), np.float32)
         if len(places) > 1:
-            fused.renew_ahead(target, sizes, *kept, replay.size, places, layout)
-        fused.update(
+            compiled.renew_ahead(target, sizes, *kept, replay.size, places, layout)
+        compiled.update(
             online,
             target,
             moments,

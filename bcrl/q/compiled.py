@@ -1,6 +1,6 @@
-"""The forest's two compiled entry points, cached on disk by what they are made of.
+"""Compiled entry points, cached on disk by what they are made of.
 
-numba compares only the file of a cached function with its cache. The parts of these two
+numba compares only the file of a cached function with its cache. The parts of these
 stand in several files, so a fingerprint of all of them is woven in: numba keys a cached
 function by the constants it closes over, and code of an older version is never run.
 """
@@ -10,31 +10,55 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 from numba import njit
 
-from bcrl.q import descend, grow, kernel, lanes, rows
+from bcrl.q import descend, fused, grow, kernel, lanes, rows, tiles
 
 
-def _fingerprint() -> int:
+def _fingerprint(*modules: ModuleType) -> int:
     digest = hashlib.sha256()
-    for module in (lanes, kernel, rows, grow, descend):
+    for module in modules:
         digest.update(Path(module.__file__).read_bytes())
     return int.from_bytes(digest.digest()[:6], "big")
 
 
-def _entry_points(fingerprint: int) -> tuple[Callable, Callable]:
-    @njit(cache=True, nogil=True)
-    def grow_forest(x, y, multiplicity, seeds, queries, settings, keep):
-        _ = fingerprint
-        return grow.grow_forest(x, y, multiplicity, seeds, queries, settings, keep)
+_compiled = njit(cache=True, nogil=True)
 
-    @njit(cache=True, nogil=True)
-    def predict_forest(nodes, values, first, x):
+
+def _forest(fingerprint: int) -> tuple[Callable, Callable]:
+    @_compiled
+    def grow_forest(*given):
         _ = fingerprint
-        return descend.predict_forest(nodes, values, first, x)
+        return grow.grow_forest(*given)
+
+    @_compiled
+    def predict_forest(*given):
+        _ = fingerprint
+        return descend.predict_forest(*given)
 
     return grow_forest, predict_forest
 
 
-grow_forest, predict_forest = _entry_points(_fingerprint())
+def _networks(fingerprint: int) -> tuple[Callable, Callable, Callable]:
+    @_compiled
+    def outputs(*given):
+        _ = fingerprint
+        return fused.outputs(*given)
+
+    @_compiled
+    def renew_ahead(*given):
+        _ = fingerprint
+        return fused.renew_ahead(*given)
+
+    @_compiled
+    def update(*given):
+        _ = fingerprint
+        return fused.update(*given)
+
+    return outputs, renew_ahead, update
+
+
+grow_forest, predict_forest = _forest(_fingerprint(lanes, kernel, rows, grow, descend))
+outputs, renew_ahead, update = _networks(_fingerprint(lanes, tiles, fused))

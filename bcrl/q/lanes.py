@@ -22,14 +22,14 @@ from numba.extending import intrinsic
 
 LANES = 8
 _OURS = config.CPU_FEATURES
-_FEATURES = codegen.get_host_cpu_features() if _OURS is None else _OURS
+FEATURES = set((codegen.get_host_cpu_features() if _OURS is None else _OURS).split(","))
 #: Whether one instruction puts the lanes of a vector in any order.
-SHUFFLE = {"+avx2", "+avx512f", "+avx512vl"} <= set(_FEATURES.split(","))
+SHUFFLE = {"+avx2", "+avx512f", "+avx512vl"} <= FEATURES
 
 I8, I32, I64 = (ir.IntType(bits) for bits in (8, 32, 64))
 
 
-def _vector(element: ir.Type, lanes: int = LANES) -> ir.VectorType:
+def vector(element: ir.Type, lanes: int = LANES) -> ir.VectorType:
     return ir.VectorType(element, lanes)
 
 
@@ -39,20 +39,20 @@ def _order(chosen: int) -> int:
     return int.from_bytes(bytes(lanes), "little")
 
 
-_NUMBERS = _vector(I64)(list(range(LANES)))
+_NUMBERS = vector(I64)(list(range(LANES)))
 _ORDERS = ir.ArrayType(I64, 2**LANES)([_order(chosen) for chosen in range(2**LANES)])
 #: Instructions that put a vector's lanes in a given order, by the lanes' width.
 _PERMUTE = {64: "llvm.x86.avx512.permvar.di.512", 32: "llvm.x86.avx2.permd"}
 
 
-def _splat(b: ir.IRBuilder, value: ir.Value) -> ir.Value:
+def splat(b: ir.IRBuilder, value: ir.Value, lanes: int = LANES) -> ir.Value:
     """A vector with `value` in every lane."""
-    none = ir.Constant(_vector(value.type), ir.Undefined)
+    none = ir.Constant(vector(value.type, lanes), ir.Undefined)
     one = b.insert_element(none, value, I32(0))
-    return b.shuffle_vector(one, none, _vector(I32)([0] * LANES))
+    return b.shuffle_vector(one, none, vector(I32, lanes)([0] * lanes))
 
 
-def _call(b: ir.IRBuilder, name: str, result: ir.Type, *args: ir.Value) -> ir.Value:
+def call(b: ir.IRBuilder, name: str, result: ir.Type, *args: ir.Value) -> ir.Value:
     """A call of one of LLVM's own functions."""
     kind = ir.FunctionType(result, [arg.type for arg in args])
     return b.call(cgutils.get_or_insert_function(b.module, kind, name), args)
@@ -61,7 +61,7 @@ def _call(b: ir.IRBuilder, name: str, result: ir.Type, *args: ir.Value) -> ir.Va
 def _at(context, b: ir.IRBuilder, kind: types.Array, array, i: ir.Value) -> ir.Value:
     """Where a group of `array` begins that starts with element `i`."""
     start = b.gep(context.make_array(kind)(context, b, array).data, [i])
-    return b.bitcast(start, _vector(start.type.pointee).as_pointer())
+    return b.bitcast(start, vector(start.type.pointee).as_pointer())
 
 
 def _load(b: ir.IRBuilder, where: ir.Value) -> ir.Value:
@@ -72,21 +72,21 @@ def _load(b: ir.IRBuilder, where: ir.Value) -> ir.Value:
 def _groups(b: ir.IRBuilder, start, stop) -> Iterator[tuple[ir.Value, ir.Value]]:
     """A loop over the groups of `start:stop`: where each begins, its living lanes."""
     with cgutils.for_range_slice(b, start, stop, I64(LANES)) as (i, _):
-        rest = _splat(b, b.sub(stop, i))
+        rest = splat(b, b.sub(stop, i))
         yield i, b.icmp_unsigned("<", _NUMBERS, rest)
 
 
 def _limit(b: ir.IRBuilder, cut: ir.Value) -> ir.Value:
     """The greatest word whose upper key is at most `cut`, in every lane."""
     upper = b.shl(b.sext(cut, I64), I64(32))
-    return _splat(b, b.or_(upper, I64(0xFFFFFFFF)))
+    return splat(b, b.or_(upper, I64(0xFFFFFFFF)))
 
 
 def _fold(b: ir.IRBuilder, vector: ir.Value, name: str) -> ir.Value:
     """All lanes taken together by LLVM's reduction `name`."""
     element = vector.type.element
     full = f"llvm.vector.reduce.{name}.v{LANES}i{element.width}"
-    return _call(b, full, element, vector)
+    return call(b, full, element, vector)
 
 
 @intrinsic
@@ -97,7 +97,7 @@ def extremes(typing, words, start, stop):
         words, start, stop = args
         kind = signature.args[0]
         first = b.load(b.gep(context.make_array(kind)(context, b, words).data, [start]))
-        filler, pairs = _splat(b, first), _vector(I32, 2 * LANES)
+        filler, pairs = splat(b, first), vector(I32, 2 * LANES)
         keys = b.bitcast(filler, pairs)
         best = [(sign, cgutils.alloca_once_value(b, keys)) for sign in "<>"]
         with _groups(b, start, stop) as (i, alive):
@@ -108,7 +108,7 @@ def extremes(typing, words, start, stop):
                 b.store(b.select(b.icmp_signed(sign, keys, old), keys, old), kept)
         ends = []
         for feature in range(2):
-            every_other = _vector(I32)(list(range(feature, 2 * LANES, 2)))
+            every_other = vector(I32)(list(range(feature, 2 * LANES, 2)))
             for name, (_, kept) in zip(("smin", "smax"), best, strict=True):
                 keys = b.load(kept)
                 ends.append(_fold(b, b.shuffle_vector(keys, keys, every_other), name))
@@ -123,7 +123,7 @@ def _tally(weighted: bool) -> Callable:
     def generate(context, b, signature, args):
         words, target, *weight, start, stop, cut0, cut1 = args
         arrays = [words, target, *weight]
-        zero = _vector(I64)([0] * LANES)
+        zero = vector(I64)([0] * LANES)
         sides = [
             (rise, _limit(b, cut), [cgutils.alloca_once_value(b, zero) for _ in "ws"])
             for rise, cut in ((32, cut0), (0, cut1))
@@ -133,10 +133,10 @@ def _tally(weighted: bool) -> Callable:
                 _load(b, _at(context, b, kind, array, i))
                 for kind, array in zip(signature.args, arrays, strict=False)
             )
-            w = w[0] if weighted else _vector(I64)([1] * LANES)
+            w = w[0] if weighted else vector(I64)([1] * LANES)
             parts = (w, b.mul(w, y) if weighted else y)
             for rise, limit, sums in sides:
-                raised = b.shl(group, _splat(b, I64(rise)))
+                raised = b.shl(group, splat(b, I64(rise)))
                 goes = b.and_(b.icmp_signed("<=", raised, limit), alive)
                 for part, total in zip(parts, sums, strict=True):
                     b.store(b.add(b.load(total), b.select(goes, part, zero)), total)
@@ -179,21 +179,21 @@ def sift(typing, columns, source, end, left, right, rise, cut):
         groups = [_load(b, _at(context, b, *pair, source)) for pair in pairs]
         rest = b.sub(end, source)
         rest = b.select(b.icmp_unsigned("<", rest, I64(LANES)), rest, I64(LANES))
-        alive = b.icmp_unsigned("<", _NUMBERS, _splat(b, rest))
-        raised = b.shl(groups[0], _splat(b, rise))
+        alive = b.icmp_unsigned("<", _NUMBERS, splat(b, rest))
+        raised = b.shl(groups[0], splat(b, rise))
         goes = b.icmp_signed("<=", raised, _limit(b, cut))
         chosen = b.bitcast(b.and_(goes, alive), I8)
-        moved = b.zext(_call(b, "llvm.ctpop.i8", I8, chosen), I64)
-        first = b.icmp_unsigned("<", _NUMBERS, _splat(b, moved))
+        moved = b.zext(call(b, "llvm.ctpop.i8", I8, chosen), I64)
+        first = b.icmp_unsigned("<", _NUMBERS, splat(b, moved))
         second = b.and_(b.not_(first), alive)
         table = cgutils.global_constant(b.module, "bcrl.orders", _ORDERS)
         order = b.load(b.gep(table, [I64(0), b.zext(chosen, I64)]))
-        order = b.bitcast(order, _vector(I8))
+        order = b.bitcast(order, vector(I8))
         ends = ((left, first), (b.sub(b.add(right, I64(1)), rest), second))
         for pair, group in zip(pairs, groups, strict=True):
             width = group.type.element.width
             index = b.zext(order, group.type)
-            packed = _call(b, _PERMUTE[width], group.type, group, index)
+            packed = call(b, _PERMUTE[width], group.type, group, index)
             for start, lanes in ends:
                 # Blended and stored whole: a masked store is slow to be read again.
                 where = _at(context, b, *pair, start)

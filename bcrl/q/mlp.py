@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bcrl.q import Values, each, fused
+from bcrl.q import Values, compiled, each
+from bcrl.q.tiles import FADED
 
 Tensor = torch.Tensor
 
@@ -137,8 +138,8 @@ class Adam:
         first, second = self.moments
         first.lerp_(gradient, 1.0 - b1)
         second.mul_(b2).addcmul_(gradient, gradient, value=1.0 - b2)
-        first.masked_fill_(first.abs() < fused.FADED, 0.0)
-        second.masked_fill_(second < fused.FADED, 0.0)
+        first.masked_fill_(first.abs() < FADED, 0.0)
+        second.masked_fill_(second < FADED, 0.0)
         parameters.addcdiv_(first, second.sqrt().mul_(scale).add_(eps), value=-rate)
 
 
@@ -165,7 +166,7 @@ class DeepQ:
         flat, inputs = networks.flat, np.ascontiguousarray(x, np.float32)
         if flat.device.type == "cpu":
             sizes = np.array(networks.sizes)
-            return fused.outputs(flat.numpy(), sizes, inputs).astype(np.float64)
+            return compiled.outputs(flat.numpy(), sizes, inputs).astype(np.float64)
         values = networks.forward(torch.from_numpy(inputs).to(flat.device))
         return values.cpu().numpy().astype(np.float64)
 
