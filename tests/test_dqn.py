@@ -325,6 +325,13 @@ def test_an_absurd_learning_rate_fails_its_seeds_by_name():
     assert moments[-1] == {0: "non-finite weights", 1: "non-finite weights"}
 
 
+def test_a_loss_that_is_no_number_fails_its_seed_though_its_weights_are():
+    run = Lockstep(TINY, staged(TINY, TARGET), Start(), team(0, 1, 2))
+    run.loss[1], run.loss[2] = np.nan, np.inf
+    run.updates = 1
+    assert run.moment(1).failed == {1: "non-finite loss", 2: "non-finite loss"}
+
+
 def test_one_seeds_weights_that_fail_leave_the_others_alone():
     settings = replace(TINY, steps=30)
     expected = weights(last(learn(settings, seeds=(0, 1, 2))))

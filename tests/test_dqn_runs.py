@@ -113,9 +113,9 @@ def test_evaluating_twice_as_often_leaves_training_unchanged(tmp_path):
 def test_a_diverging_seed_is_recorded_and_the_run_ends_well(tmp_path, capsys):
     p = run(tmp_path, *LINEAR, "variant=BC", "algorithm.learning_rate=1e30", "tag=x")
     about = json.loads((p.directory / "seed_0000.json").read_text())
-    assert about["status"] == "failed: non-finite loss at step 2700"
+    assert about["status"] == "failed: non-finite weights at step 2700"
     assert math.isnan(rows(p, 0)[-1]["q_mean"])
-    assert "seed 0 failed: non-finite loss" in capsys.readouterr().err
+    assert "seed 0 failed: non-finite weights" in capsys.readouterr().err
     # It would fail in the same way again, so it is not computed again.
     assert is_complete(p.directory, 0) and pending(p) == []
 

@@ -259,6 +259,16 @@ def test_gradients_do_not_leak_where_the_unit_is_off():
         assert not w1.any() and not b1.any() and not w2.any() and b2.any()
 
 
+@WAYS
+def test_a_gradient_that_is_no_number_is_seen_in_the_weights(way):
+    deep, replay = learner((16,), (0, 1)), filled((0, 1))
+    replay.rows[1, :, -3] = math.nan
+    losses = losses_of(way(deep, replay), places((0, 1), 1)[0])
+    assert math.isfinite(losses[0]) and math.isnan(losses[1])
+    assert deep.online.flat[0].isfinite().all()
+    assert deep.online.flat[1].isnan().any()
+
+
 @njit
 def adam(to, gradient):
     """A step of Adam on arrays (1, n): the gradient is a product of one term."""
