@@ -36,9 +36,9 @@ class Room(NamedTuple):
     slopes: NDArray[np.float32]  # the same of ∂loss/∂(what a ReLU is given)
     turned: NDArray[np.float32]  # (n, widest): one layer's slopes, transposed
     alive: NDArray[np.int64]  # (L, widest + 1): units on in some column, then the ones
+    dead: NDArray[np.int64]  # (L, widest + 1): the other units
     n_alive: NDArray[np.int64]  # (L,): how many are on
     some: NDArray[np.int32]  # (widest,): not 0 if the unit is on in some column
-    dead: NDArray[np.int64]  # (widest,): units that are not
     all: NDArray[np.int64]  # (widest or n,): all units of a layer, or columns
 
 
@@ -52,9 +52,9 @@ def space(sizes, n):
         np.zeros(shape, np.float32),
         np.zeros((padded(n, LANES), padded(widest, WIDTH)), np.float32),
         np.zeros((layers, widest + 1), np.int64),
+        np.zeros((layers, widest + 1), np.int64),
         np.zeros(layers, np.int64),
         np.zeros(widest, np.int32),
-        np.zeros(widest + 1, np.int64),
         np.arange(max(n, widest)),
     )
 
@@ -67,10 +67,10 @@ def forward(flat, sizes, room, n):
     for layer in range(last + 1):
         n_in, n_out = sizes[layer], sizes[layer + 1]
         before, after = room.units[layer], room.units[layer + 1]
-        before[n_in], alive = np.float32(1.0), room.alive[layer]
-        m = 0
-        for k in range(n_in):
-            alive[m] = k
+        before[n_in] = np.float32(1.0)
+        alive, dead, m = room.alive[layer], room.dead[layer], 0
+        for k in range(n_in):  # it stays in one of the lists, the next takes the other
+            alive[m] = dead[k - m] = k
             m += room.some[k] != 0
         alive[m] = n_in
         room.n_alive[layer] = m
@@ -108,13 +108,8 @@ def backward(flat, first, second, sizes, room, n, constants):
         to = (weights.reshape(shape), *moments, *constants)
         factors = (before.reshape(-1), before.shape[1], 1, room.turned)
         tiles.product_adam(to, n_out, alive, m + 1, room.all, n, *factors)
-        dead, n_dead, k = room.dead, 0, 0
-        for i in range(m + 1):
-            while k < alive[i]:
-                dead[n_dead] = k
-                n_dead, k = n_dead + 1, k + 1
-            k += 1
-        tiles.product_adam(to, n_out, dead, n_dead, room.all, 0, *factors)
+        dead = room.dead[layer]
+        tiles.product_adam(to, n_out, dead, n_in - m, room.all, 0, *factors)
         if layer:
             for column in range(0, n, LANES):
                 for row in range(0, n_in, LANES):
