@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 from bcrl import config, records, runner, vetting
 from bcrl.compose import Plan
 from bcrl.errors import BcrlError
+from bcrl.files import make_directory
 
 REFUSED = 2  # exit code
 
@@ -53,7 +54,7 @@ def _vet(arguments: Namespace) -> list[Plan]:
         return []
     for plan in plans:
         records.check_directory(plan)
-    records.make_directory(plans[0].root)
+    make_directory(plans[0].root, "runs_dir")
     return plans
 
 

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from bcrl import __version__
 from bcrl.compose import Plain, Plan, differences, identity
 from bcrl.errors import BcrlError
-from bcrl.files import write_atomically, write_text
+from bcrl.files import make_directory, sealed, sha256, write_atomically, write_text
 
-SCHEMA = 1  # raised when a file's meaning changes
+SCHEMA = 2  # raised when a file's meaning changes
 LIBRARIES = ("hydra-core", "numpy", "numba", "scikit-learn", "torch")
 
 
@@ -49,16 +49,6 @@ def check_directory(plan: Plan) -> None:
         )
 
 
-def make_directory(directory: Path) -> None:
-    """Make a folder and those above it; BcrlError if that can't be done."""
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BcrlError(
-            f"runs_dir: can't make {directory}: {error.strerror}"
-        ) from error
-
-
 def pending(plan: Plan) -> list[int]:
     """The plan's seeds that are not complete yet; BcrlError as `check_directory`."""
     check_directory(plan)
@@ -67,7 +57,7 @@ def pending(plan: Plan) -> list[int]:
 
 def begin(plan: Plan) -> None:
     """Make the plan's directory, with its config."""
-    make_directory(plan.directory)
+    make_directory(plan.directory, "runs_dir")
     text = yaml.safe_dump(identity(plan.config), sort_keys=False, allow_unicode=True)
     write_text(plan.directory / "config.yaml", text)
 
@@ -78,36 +68,21 @@ def seed_path(directory: Path, seed: int, suffix: str) -> Path:
 
 
 def is_complete(directory: Path, seed: int) -> bool:
-    """Whether this seed's metadata, written last, says that all of it is there.
-
-    A seed that failed is done, too: it would fail in the same way again.
-    """
+    """Whether this seed's metadata, written last, says that all of it is there."""
     try:
         metadata = json.loads(seed_path(directory, seed, "json").read_text())
-        done = metadata["status"] == "complete" or metadata["status"].startswith("fail")
-        complete = done and metadata["schema"] == SCHEMA
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        complete = (metadata["status"], metadata["schema"]) == ("complete", SCHEMA)
+    except (OSError, ValueError, KeyError, TypeError):
         return False
     files = [seed_path(directory, seed, suffix) for suffix in ("csv", "npz")]
     return complete and all(file.exists() for file in files)
 
 
-def write_seed(
-    plan: Plan,
-    seed: int,
-    status: str,
-    rows: Sequence[Mapping[str, int | float]],
-    arrays: Mapping[str, NDArray],
-    facts: Plain,
-) -> None:
-    """One seed's CSV, NPZ and, last, JSON with `facts` and where it was computed.
+def write_status(plan: Plan, seed: int, status: str, facts: Plain) -> None:
+    """One seed's JSON: `status` (`running`, `complete` or `failed: why`), and `facts`.
 
-    `status` is `complete` or `failed: why`.
+    It is sealed: its `digest` tells whether a value was changed.
     """
-    directory = plan.directory
-    lines = [",".join(rows[0])]
-    lines += [",".join(repr(value) for value in row.values()) for row in rows]
-    text = "\n".join(lines) + "\n"
     config = plan.config
     metadata = {
         "schema": SCHEMA,
@@ -120,12 +95,26 @@ def write_seed(
         **facts,
         "config": config,
     }
-    write_atomically(
-        seed_path(directory, seed, "npz"), lambda file: np.savez(file, **dict(arrays))
-    )
-    write_text(seed_path(directory, seed, "csv"), text)
-    dump = json.dumps(metadata, indent=1, ensure_ascii=False, allow_nan=False)
-    write_text(seed_path(directory, seed, "json"), dump)
+    write_text(seed_path(plan.directory, seed, "json"), sealed(metadata))
+
+
+def write_seed(
+    plan: Plan,
+    seed: int,
+    status: str,
+    rows: Sequence[Mapping[str, int | float]],
+    arrays: Mapping[str, NDArray],
+    facts: Plain,
+) -> None:
+    """One seed's CSV, NPZ and, last, JSON, which has the hashes of both."""
+    lines = [",".join(rows[0])]
+    lines += [",".join(repr(value) for value in row.values()) for row in rows]
+    text = "\n".join(lines) + "\n"
+    csv, npz = (seed_path(plan.directory, seed, suffix) for suffix in ("csv", "npz"))
+    write_atomically(npz, lambda file: np.savez(file, **dict(arrays)))
+    write_text(csv, text)
+    hashes = {"sha256": {"csv": sha256(csv), "npz": sha256(npz)}}
+    write_status(plan, seed, status, hashes | facts)
 
 
 def closing_table(plans: Sequence[Plan], seconds: float) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.errors import BcrlError
-from bcrl.files import write_text
+from bcrl.files import make_directory, write_text
 
 SEAL = b"# sha256 "
 
@@ -68,4 +68,5 @@ def _write(path: Path, table: NDArray[np.int64]) -> None:
     body = "".join(",".join(map(str, row)) + "\n" for row in table.tolist())
     seal = SEAL.decode() + hashlib.sha256(body.encode()).hexdigest() + "\n"
     with contextlib.suppress(BcrlError):
+        make_directory(path.parent, "BCRL_CACHE")
         write_text(path, body + seal)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from bcrl import __version__
 from bcrl.errors import BcrlError
-from bcrl.files import write_text
+from bcrl.files import make_directory, write_text
 from bcrl.report import style
 from bcrl.report.curves import LINEAR, figure_methods
 from bcrl.report.document import claims_report
@@ -115,6 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for note in runs.notes:
             print(f"note: {note.text}", file=sys.stderr)
         out = options.out or options.runs_dir / "figures"
+        make_directory(out, "--out")
         files, skipped = report(runs, out, list(chosen), options.tag)
     except BcrlError as error:
         print(f"bcrl-report: {error}", file=sys.stderr)
