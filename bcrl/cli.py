@@ -14,8 +14,10 @@ from bcrl import config, records, runner, vetting
 from bcrl.compose import Plan
 from bcrl.errors import BcrlError
 from bcrl.files import make_directory
+from bcrl.interrupts import EXIT_CODE, Interrupted
 
-REFUSED = 2  # exit code
+#: Exit codes, besides 0: seeds failed; bad input or no place to write; a signal.
+FAILED, REFUSED, INTERRUPTED = 1, 2, EXIT_CODE
 
 
 def main() -> None:
@@ -31,11 +33,14 @@ def main() -> None:
             runner.run(*plans)
         else:
             _run_job()
+    except runner.SeedsFailed as error:
+        sys.exit(_complain(error, FAILED))
     except BcrlError as error:
-        sys.exit(_complain(error))
-    except KeyboardInterrupt:
-        print("bcrl: interrupted; complete seeds are kept", file=sys.stderr)
-        sys.exit(130)
+        sys.exit(_complain(error, REFUSED))
+    except (Interrupted, KeyboardInterrupt):
+        text = "interrupted; run the same command again to go on from here"
+        print(f"bcrl: {text}", file=sys.stderr)
+        sys.exit(INTERRUPTED)
 
 
 def _vet(arguments: Namespace) -> list[Plan]:
@@ -65,12 +70,9 @@ def _run_job(composed: DictConfig) -> None:
     """One job of Hydra's: its composed config is planned and run."""
     now = HydraConfig.get().runtime
     folders = [source.path for source in now.config_sources if source.schema == "file"]
-    try:
-        runner.run(vetting.plan(composed, now.choices, folders))
-    except BcrlError as error:
-        sys.exit(_complain(error))
+    runner.run(vetting.plan(composed, now.choices, folders))
 
 
-def _complain(error: BcrlError) -> int:
+def _complain(error: BcrlError, code: int) -> int:
     print(f"bcrl: {error}", file=sys.stderr)
-    return REFUSED
+    return code

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -36,6 +37,7 @@ class Plan:
     lockstep: int
     device: str
     config: Plain  # resolved, whole
+    command: str = "bcrl"  # what runs this plan alone
 
     @property
     def target(self) -> Env:
@@ -174,6 +176,9 @@ def _check_outputs(config: Plain) -> None:
     at_least("scale.max_iterations", scale["max_iterations"], 1)
     at_least("scale.max_episodes", scale["max_episodes"], 1)
     at_least("scale.max_steps", scale["max_steps"], 1)
+    if not config["checkpoint_every"] > 0 or config["checkpoint_every"] == math.inf:
+        why = "must be a number of seconds above 0"
+        raise ConfigError("checkpoint_every", config["checkpoint_every"], why)
     one_of("progress", config["progress"], ["auto", "bar", "lines", "none"])
     for key, value in (("tag", config["tag"]), ("scale.name", scale["name"])):
         if value is not None and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", value):

@@ -51,13 +51,14 @@ class Config:
     runs_dir: str = "runs"
     tag: str | None = None
     progress: str = "auto"
+    checkpoint_every: float = 60.0
 
 
 #: Keys that don't belong to a configuration's identity: they change no number, but for
 #: another device's rounding.
 OUTPUT_KEYS = (
     *("seeds", "workers", "threads", "device"),
-    *("runs_dir", "tag", "progress"),
+    *("runs_dir", "tag", "progress", "checkpoint_every"),
 )
 
 

@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.envs import Env, is_finite
+from bcrl.pack import storable
 from bcrl.rollout import Episodes, transition_tables
 
 
+@storable
 @dataclass(frozen=True)
 class ActionRows:
     """The regression problem of one action: n rows, and the points it doesn't cover."""
@@ -22,6 +24,7 @@ class ActionRows:
     query_points: NDArray[np.intp]  # (m,) which points those are
 
 
+@storable
 @dataclass(frozen=True)
 class Dataset:
     """One seed's transitions; states are rows of `points`, so Q is asked once a point.

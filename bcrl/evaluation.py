@@ -52,8 +52,8 @@ class StepProbe:
 
     seeds: Sequence[int]
     tasks: Sequence[Env]
-    _q: list[NDArray[np.float32]] = field(default_factory=list)
-    _learners: list[str] = field(default_factory=list)
+    #: At each stage's end: who has learned it, and Q at `states` (S, n, A).
+    kept: list[tuple[str, NDArray[np.float32]]] = field(default_factory=list)
 
     index: ClassVar[str] = "step"  # what a moment's count is
 
@@ -68,16 +68,16 @@ class StepProbe:
         if now.last_of_stage:
             env, n = now.stage.env, len(self.seeds)
             asked = np.broadcast_to(self.states, (n, *self.states.shape))
-            self._q.append(np.asarray(now.learned.q(asked, env.n_actions), np.float32))
-            self._learners.append(now.stage.learner.name)
+            q = np.asarray(now.learned.q(asked, env.n_actions), np.float32)
+            self.kept.append((now.stage.learner.name, q))
         return evaluate(now, self.seeds)
 
     def arrays(self, s: int) -> dict[str, NDArray]:
         """What seed number s ends with: the stages' Q at `states`."""
-        kept = np.stack([q[s] for q in self._q])
+        kept = np.stack([q[s] for _, q in self.kept])
         found = {"states": self.states, "q": kept[-1], "q_stages": kept}
         return found | scene(self.tasks)
 
     def facts(self) -> dict[str, Any]:
         """What else is known of the run: the learner of each stage."""
-        return {"learners": self._learners}
+        return {"learners": [name for name, _ in self.kept]}

@@ -63,12 +63,12 @@ def make_directory(directory: Path, key: str) -> None:
         raise BcrlError(f"{key}: can't make {directory}: {error.strerror}") from error
 
 
-def remove_half_written(folder: Path, name: str) -> None:
-    """Remove what a process killed while it wrote `name` (or `name`.*) has left.
+def remove_half_written(folder: Path, start: str) -> None:
+    """Remove what processes killed while writing files `start`… have left.
 
-    For those only who hold the lock under which these files are written.
+    For those only who hold the lock under which such files are written.
     """
-    for left in (*folder.glob(f".{name}.*.tmp"), *folder.glob(f".{name}.*.*.tmp")):
+    for left in folder.glob(f".{start}*.tmp"):
         left.unlink(missing_ok=True)
 
 

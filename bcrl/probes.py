@@ -82,7 +82,7 @@ class Probe:
     seeds: Sequence[int]
     tasks: Sequence[Env]
     metrics: Sequence[str]
-    _residuals: list[Values] = field(default_factory=list)  # at the end of each stage
+    kept: list[Values] = field(default_factory=list)  # residuals at each stage's end
 
     index: ClassVar[str] = "iteration"  # what a snapshot's count is
 
@@ -133,7 +133,7 @@ class Probe:
             for s in range(len(self.seeds))
         )
         if snapshot.last_of_stage:
-            self._residuals.append(snapshot.probed_residual)
+            self.kept.append(snapshot.probed_residual)
             self._last = snapshot, episodes
         return [{m: float(METRICS[m](v)) for m in self.metrics} for v in views]
 
@@ -143,7 +143,7 @@ class Probe:
         found = {
             "states": self.states,
             "q": snapshot.probed_q[s],
-            "residuals": np.stack([each[s] for each in self._residuals]),
+            "residuals": np.stack([each[s] for each in self.kept]),
         }
         if episodes.length.shape[1] == 1:  # one evaluation episode: keep its path
             found["trajectory"] = episodes.state[s, 0, : episodes.length[s, 0] + 1]

@@ -61,7 +61,7 @@ class Progress:
         self.share[tick.job] = share
         where = (
             f"{job.name} · T{tick.task} · {job.unit} {tick.count}/{job.length}"
-            f" · {_named(job.seeds)}"
+            f" · {named(job.seeds)}"
         )
         all_done = sum(self.share) == len(self.jobs)
         done = 1.0 if all_done else self.done / self.total
@@ -110,7 +110,8 @@ def _clock(seconds: float) -> str:
     return tqdm.format_interval(seconds)
 
 
-def _named(seeds: Sequence[int]) -> str:
+def named(seeds: Sequence[int]) -> str:
+    """`seeds 0–19`, or one by one if they are not in a row."""
     first, last = seeds[0], seeds[-1]
     if last - first + 1 == len(seeds) > 1:
         return f"seeds {first}–{last}"

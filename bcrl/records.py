@@ -20,6 +20,7 @@ from bcrl import __version__
 from bcrl.compose import Plain, Plan, differences, identity
 from bcrl.errors import BcrlError
 from bcrl.files import make_directory, sealed, sha256, write_atomically, write_text
+from bcrl.locks import waited_for
 
 SCHEMA = 2  # raised when a file's meaning changes
 LIBRARIES = ("hydra-core", "numpy", "numba", "scikit-learn", "torch")
@@ -56,10 +57,15 @@ def pending(plan: Plan) -> list[int]:
 
 
 def begin(plan: Plan) -> None:
-    """Make the plan's directory, with its config."""
-    make_directory(plan.directory, "runs_dir")
-    text = yaml.safe_dump(identity(plan.config), sort_keys=False, allow_unicode=True)
-    write_text(plan.directory / "config.yaml", text)
+    """Make the plan's directory, with its config, or BcrlError as `check_directory`."""
+    directory = plan.directory
+    make_directory(directory, "runs_dir")
+    with waited_for(directory, "config"):  # others may be about to begin, too
+        check_directory(plan)
+        if not (directory / "config.yaml").exists():
+            config = identity(plan.config)
+            text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
+            write_text(directory / "config.yaml", text)
 
 
 def seed_path(directory: Path, seed: int, suffix: str) -> Path:
@@ -125,17 +131,14 @@ def closing_table(plans: Sequence[Plan], seconds: float) -> str:
     head = f"{'':32}{'seeds':>7}{'failed':>8}{'CPU s a seed':>14}{'core min':>10}"
     lines, total, peak = [head], 0.0, 0.0
     for plan in plans:
-        facts = [
-            json.loads(seed_path(plan.directory, seed, "json").read_text())
-            for seed in plan.seeds
-        ]
-        spent = sum(fact.get("cpu_seconds", 0.0) for fact in facts)
-        failed = sum(fact["status"] != "complete" for fact in facts)
-        total += spent
+        facts = [_facts(plan, seed) for seed in plan.seeds]
+        spent = [fact["cpu_seconds"] for fact in facts if "cpu_seconds" in fact]
+        failed = sum(fact.get("status") != "complete" for fact in facts)
+        total += sum(spent)
         peak = max(peak, *(fact.get("peak_memory_mib", 0.0) for fact in facts))
         lines.append(
             f"{plan.env + ' ' + plan.name:32}{len(facts):7}{failed:8}"
-            f"{spent / len(facts):14.2f}{spent / 60:10.1f}"
+            f"{sum(spent) / max(1, len(spent)):14.2f}{sum(spent) / 60:10.1f}"
         )
     lines.append(f"{'in all':61}{total / 60:10.1f}")
     workers = plans[0].config["workers"]
@@ -144,6 +147,14 @@ def closing_table(plans: Sequence[Plan], seconds: float) -> str:
         f"peak memory of a process that trains: {peak:.0f} MiB"
     )
     return "\n".join(lines)
+
+
+def _facts(plan: Plan, seed: int) -> Plain:
+    """A seed's metadata, nothing if it has none."""
+    try:
+        return json.loads(seed_path(plan.directory, seed, "json").read_text())
+    except (OSError, ValueError):
+        return {}
 
 
 def provenance() -> dict[str, Any]:

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from bcrl.pack import storable
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -25,28 +27,41 @@ class Batch:
     action: torch.Tensor  # (S, B, 1), int64
 
 
+@storable
+@dataclass(eq=False)
 class Replay:
     """The last `capacity` transitions of each seed, and their targets' frozen parts.
 
     What base and shaping add to a target is fixed when a transition is stored, so it is
-    computed once and not for every batch that draws it. `bootstrap` (S, capacity) has
-    room for a row's max_a' (ϱ + base)(s') by the target network, `known` says which are
-    so: none in a new row, and none after `forget`.
+    computed once and not for every batch that draws it. `bootstrap` has room for a
+    row's max_a' (ϱ + base)(s') by the target network, `known` says which are so: none
+    in a new row, and none after `forget`.
     """
 
-    def __init__(
-        self, n_seeds: int, capacity: int, d: int, n_actions: int, device: str
-    ) -> None:
-        self.d, self.n_actions, self.capacity = d, n_actions, capacity
-        width = 2 * d + n_actions + 3
-        self.rows = torch.zeros((n_seeds, capacity, width), device=device)
-        self.added = 0
+    rows: torch.Tensor  # (S, capacity, 2 d + A + 3)
+    bootstrap: NDArray[np.float32]  # (S, capacity)
+    known: NDArray[np.bool_]  # (S, capacity)
+    d: int
+    n_actions: int
+    added: int = 0
+
+    @classmethod
+    def empty(
+        cls, n_seeds: int, capacity: int, d: int, n_actions: int, device: str
+    ) -> Replay:
+        """A replay that nothing was added to."""
+        shape = (n_seeds, capacity)
+        rows = torch.zeros((*shape, 2 * d + n_actions + 3), device=device)
+        bootstrap, known = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
+        return cls(rows, bootstrap, known, d, n_actions)
+
+    def __post_init__(self) -> None:
+        n_seeds, self.capacity, width = self.rows.shape
         on_cpu = self.rows.device.type == "cpu"
         self._shared = self.rows.numpy() if on_cpu else None  # the same memory
-        self.bootstrap = np.zeros((n_seeds, capacity), np.float32)
-        self.known = np.zeros((n_seeds, capacity), np.bool_)
         self._row = np.empty((n_seeds, 1, width), np.float32)
-        self._first = torch.arange(n_seeds, device=device)[:, None] * capacity
+        first = torch.arange(n_seeds, device=self.rows.device)
+        self._first = first[:, None] * self.capacity
 
     @property
     def size(self) -> int:
@@ -77,12 +92,12 @@ class Replay:
         """The target network has changed: no bootstrap value is known any longer."""
         self.known[:] = False
 
-    def places(self, u: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Which of a seed's rows uniforms u (T, S, B) pick in the next T steps.
+    def places(self, u: NDArray[np.float64], past: int = 0) -> NDArray[np.int64]:
+        """Which of a seed's rows uniforms u (T, S, B) pick in T steps.
 
-        Step t comes after adding t + 1 more; with replacement.
+        Step t comes after adding t + 1 − `past` more; with replacement.
         """
-        held = np.arange(1, len(u) + 1) + self.added
+        held = np.arange(1, len(u) + 1) + self.added - past
         return (u * np.minimum(held, self.capacity)[:, None, None]).astype(np.int64)
 
     def sample(self, places: torch.Tensor) -> Batch:

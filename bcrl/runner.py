@@ -1,54 +1,66 @@
-"""The one runner: the seeds of plans, trained in lockstep groups, become records."""
+"""The one runner: the seeds of plans become jobs, done by processes, and records."""
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-import queue
-import resource
-import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, wait
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from bcrl import costs, oracle, records
+from bcrl import checkpoints, costs, locks, oracle, progress, records, training
 from bcrl.compose import Plan
 from bcrl.envs import Env
 from bcrl.errors import BcrlError
-from bcrl.evaluation import StepProbe
-from bcrl.probes import Probe
-from bcrl.progress import Job, Progress, Tick
-from bcrl.stage import Team, learn
+from bcrl.interrupts import Interrupted, Stop
+from bcrl.workers import Died, each
 
 Seeds = tuple[int, ...]
+
+
+@dataclass
+class Failed:
+    """A plan's seeds that failed, and why."""
+
+    plan: Plan
+    why: dict[int, str] = field(default_factory=dict)
+
+
+Failures = dict[Path, Failed]  # by the plan's directory
+
+
+class SeedsFailed(BcrlError):
+    """Some seeds failed, all others are complete: which, why, and what reruns them."""
 
 
 def run(*plans: Plan) -> None:
     """Compute and record every seed of the plans that is not complete yet.
 
-    All of them share one pool of processes: jobs of a few seeds, the longest first.
+    All of them share one pool of processes: jobs of a few seeds, the longest first. A
+    seed that another process computes is waited for. Raises SeedsFailed at the end if
+    seeds failed, Interrupted if a signal came, both with everything else kept.
     """
     began, options = time.perf_counter(), plans[0].config
-    plans = tuple(merged(plans))
-    work = ordered(plans)
+    plans, stop = tuple(merged(plans)), Stop()
+    failed: Failures = {}
+    with stop.on_signals(second_ends_all=True):
+        if options["progress"] != "none":
+            _say_what_is_done(plans)
+        while (work := ordered(plans, failed)) and not stop.asked:
+            _search_references([plan for plan, _ in work])
+            if busy := _train(work, options, failed, stop):
+                _wait(busy, options["progress"], stop)
     if work:
-        _search_references([plan for plan, _ in work])
-        workers = min(options["workers"], len(work))
-        jobs = [_job(plan, seeds) for plan, seeds in work]
-        progress = Progress(jobs, workers, options["progress"])
-        try:
-            _train(work, workers, options["threads"], progress.tick)
-        finally:
-            progress.close()
+        raise Interrupted
     if len(plans) > 1 and options["progress"] != "none":
         spent = time.perf_counter() - began
         print(records.closing_table(plans, spent), file=sys.stderr)
+    if failed:
+        raise SeedsFailed(told(failed))
 
 
 def merged(plans: Sequence[Plan]) -> Iterator[Plan]:
@@ -61,13 +73,25 @@ def merged(plans: Sequence[Plan]) -> Iterator[Plan]:
     yield from together.values()
 
 
-def ordered(plans: Sequence[Plan]) -> list[tuple[Plan, Seeds]]:
-    """The jobs that remain to be done, the one expected to be longest first."""
-    pending = [(plan, seeds) for plan in plans if (seeds := _pending(plan))]
+def ordered(plans: Sequence[Plan], failed: Failures) -> list[tuple[Plan, Seeds]]:
+    """The jobs that remain to be done, the one expected to be longest first.
+
+    A team with a checkpoint goes on as it was; no seed is tried again that has failed.
+    """
+    pending, work = [], []
+    for plan in plans:
+        over = failed.get(plan.directory, Failed(plan)).why
+        left = [seed for seed in _pending(plan) if seed not in over]
+        for team in checkpoints.teams(plan):
+            if set(team) & set(left):
+                work.append((plan, team))
+                left = [seed for seed in left if seed not in team]
+        if left:
+            pending.append((plan, left))
     workers = plans[0].config["workers"]
     # With variants enough to go round, seeds that train together cost less each.
     spread = 1 if len(pending) >= 2 * workers else workers
-    work = [
+    work += [
         (plan, group)
         for plan, seeds in pending
         for group in _groups(seeds, plan.lockstep, spread)
@@ -76,13 +100,19 @@ def ordered(plans: Sequence[Plan]) -> list[tuple[Plan, Seeds]]:
 
 
 def _pending(plan: Plan) -> list[int]:
-    """The plan's seeds that are to be trained."""
+    """The plan's seeds that are to be trained; what dead processes left is tidied."""
     seeds = records.pending(plan)
-    done = len(plan.seeds) - len(seeds)
-    if done and plan.config["progress"] != "none":
-        said = f"{done} of {len(plan.seeds)} seeds complete"
-        print(f"{plan.env} {plan.name}: {said}", file=sys.stderr)
+    locks.tidy(plan.directory)
+    checkpoints.remove_done(plan)
     return seeds
+
+
+def _say_what_is_done(plans: Sequence[Plan]) -> None:
+    for plan in plans:
+        done = len(plan.seeds) - len(records.pending(plan))
+        if done:
+            said = f"{done} of {len(plan.seeds)} seeds complete"
+            print(f"{plan.env} {plan.name}: {said}", file=sys.stderr)
 
 
 def _groups(seeds: list[int], lockstep: int, workers: int) -> list[Seeds]:
@@ -104,80 +134,102 @@ def _search_references(plans: Sequence[Plan]) -> None:
         oracle.reference(task)
 
 
-def _job(plan: Plan, seeds: Seeds) -> Job:
-    return Job(
+def _expected(plan: Plan, seeds: Seeds) -> progress.Job:
+    """What the progress bar wants to know of a job."""
+    return progress.Job(
         f"{plan.env} {plan.name}",
         f"{plan.env} {plan.family}",
         seeds,
         plan.length,
-        _probe(plan, ()).index,
+        training.probe_of(plan, ()).index,
         costs.expected(plan) * len(seeds),
     )
 
 
 def _train(
     work: Sequence[tuple[Plan, Seeds]],
-    workers: int,
-    threads: int | None,
-    tick: Callable[[Tick], None],
-) -> None:
-    threads = threads or max(1, _cores() // workers)
+    options: Mapping[str, Any],
+    failed: Failures,
+    stop: Stop,
+) -> list[tuple[Plan, Seeds]]:
+    """Do the jobs; what failed is added to `failed`, seeds that are busy returned."""
+    workers = min(options["workers"], len(work))
+    threads = options["threads"] or max(1, _cores() // workers)
     origin = records.provenance()  # of the code that starts, not of what it becomes
-    if workers == 1:
-        for number, (plan, seeds) in enumerate(work):
-            train = partial(train_group, plan, seeds, threads, origin, number, tick)
-            _blamed(train, plan, seeds)
-        return
-    context = multiprocessing.get_context("spawn")
-    with context.Manager() as manager:
-        ticks = manager.Queue()
-        pool = ProcessPoolExecutor(workers, context, initializer=_leave_interrupts)
-        try:
-            jobs = {
-                pool.submit(
-                    train_group, *each, threads, origin, number, ticks.put
-                ): each
-                for number, each in enumerate(work)
-            }
-            waiting = set(jobs)
-            while waiting:
-                _drain(ticks, tick)
-                done, waiting = wait(waiting, timeout=0)
-                for job in done:
-                    _blamed(job.result, *jobs[job])
-            _drain(ticks, tick)
-        except BaseException:  # a failure or Ctrl-C ends all workers at once
-            pool.shutdown(wait=False, cancel_futures=True)
-            for worker in multiprocessing.active_children():
-                worker.terminate()
-            raise
-        pool.shutdown()
-
-
-def _blamed(call: Callable[[], None], plan: Plan, seeds: Seeds) -> None:
-    """`call`, an unforeseen error of it preceded by a line that names the job."""
+    jobs = [
+        training.Job(number, plan, seeds, threads, origin)
+        for number, (plan, seeds) in enumerate(work)
+    ]
+    expected = [_expected(plan, seeds) for plan, seeds in work]
+    shown = progress.Progress(expected, workers, options["progress"])
+    busy = []
     try:
-        call()
-    except BcrlError:
-        raise
-    except Exception:
-        print(f"{plan.env} {plan.name}, seeds {seeds}: failed", file=sys.stderr)
-        raise
+        for number, outcome in _outcomes(jobs, workers, shown.tick, stop):
+            plan, seeds = work[number]
+            if isinstance(outcome, Died):
+                died = {} if stop.asked else dict.fromkeys(seeds, str(outcome))
+                outcome = training.Outcome(died)
+            if outcome.failed:
+                failed.setdefault(plan.directory, Failed(plan)).why |= outcome.failed
+            if outcome.busy:
+                busy.append((plan, outcome.busy))
+    finally:
+        shown.close()
+    return busy
 
 
-def _leave_interrupts() -> None:
-    """Ctrl-C reaches every process of a terminal; the parent alone deals with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _drain(ticks: queue.Queue, tick: Callable[[Tick], None]) -> None:
-    """Hand on the workers' ticks, waiting for a moment if there is none."""
-    try:
-        tick(ticks.get(timeout=0.2))
-        for _ in range(ticks.qsize()):
-            tick(ticks.get_nowait())
-    except queue.Empty:
+def _outcomes(
+    jobs: Sequence[training.Job],
+    workers: int,
+    tick: Callable[[progress.Tick], None],
+    stop: Stop,
+) -> Iterator[tuple[int, training.Outcome | Died]]:
+    """The jobs' numbers and outcomes, in this process or by several."""
+    if workers > 1:
+        yield from each(training.train, jobs, workers, tick, stop)
         return
+    for job in jobs:
+        if stop.asked:
+            return
+        yield job.number, training.train(job, tick, stop)
+
+
+def _wait(busy: Sequence[tuple[Plan, Seeds]], mode: str, stop: Stop) -> None:
+    """Until one of the seeds that other processes compute is free, or complete."""
+    seeds = [
+        (plan.directory, locks.seed_lock(plan.directory, seed))
+        for plan, group in busy
+        for seed in group
+    ]
+    if mode != "none":
+        directory, lock = seeds[0]
+        held = f"{lock.name} in {directory} is computed by {lock.holder()}"
+        more = f", and {len(seeds) - 1} more are" * (len(seeds) > 1)
+        print(f"waiting: {held}{more}", file=sys.stderr, flush=True)
+    pause = 0.1
+    while not stop.asked:
+        for _, lock in seeds:
+            if lock.acquire():
+                lock.release()
+                return
+        time.sleep(pause)
+        pause = min(2.0, 1.5 * pause)
+
+
+def told(failed: Failures) -> str:
+    """What failed, and the commands that run it again."""
+    count = sum(len(lost.why) for lost in failed.values())
+    lines = [f"{count} seeds failed, what else was asked for is complete:"]
+    for lost in failed.values():
+        reasons: dict[str, list[int]] = {}
+        for seed, why in lost.why.items():
+            reasons.setdefault(why, []).append(seed)
+        for why, seeds in reasons.items():
+            name = f"{lost.plan.env} {lost.plan.name}"
+            lines.append(f"  {name}, {progress.named(seeds)}: {why}")
+    lines.append("to run just these again:")
+    lines += [f"  {lost.plan.command}" for lost in failed.values()]
+    return "\n".join(lines)
 
 
 def _cores() -> int:
@@ -185,51 +237,3 @@ def _cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def train_group(
-    plan: Plan,
-    seeds: Seeds,
-    threads: int,
-    origin: dict,
-    job: int,
-    tick: Callable[[Tick], None],
-) -> None:
-    """Train a group of seeds in lockstep and write each seed's files.
-
-    origin: which code and machine, as `records.provenance` says; job: the number that
-    ticks are to bear.
-    """
-    records.begin(plan)
-    wall, cpu = time.perf_counter(), time.process_time()
-    probe = _probe(plan, seeds)
-    team = Team(seeds, probe.states, threads, plan.device)
-    rows: list[list[dict]] = [[] for _ in seeds]
-    failed: dict[int, str] = {}
-    for now in learn(plan.stages, team):
-        task = now.stage.task
-        where = {"stage": now.stage.number, "task": task, probe.index: now.count}
-        for s, metrics in enumerate(probe.measure(now)):
-            if s not in failed:  # its last row is the one that shows the failure
-                rows[s].append(where | metrics)
-        for s, why in now.failed.items():
-            failed.setdefault(s, f"{why} at {probe.index} {now.count}")
-        tick(Tick(job, task, now.count, time.perf_counter() - wall))
-    facts = probe.facts() | {
-        "wall_seconds": time.perf_counter() - wall,
-        "cpu_seconds": (time.process_time() - cpu) / len(seeds),  # this seed's share
-        "lockstep": list(seeds),
-        "device": plan.device,
-        "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-    }
-    for s, seed in enumerate(seeds):
-        status = f"failed: {failed[s]}" if s in failed else "complete"
-        if s in failed:
-            print(f"{plan.env} {plan.name}: seed {seed} {status}", file=sys.stderr)
-        records.write_seed(plan, seed, status, rows[s], probe.arrays(s), facts | origin)
-
-
-def _probe(plan: Plan, seeds: Seeds) -> Probe | StepProbe:
-    if plan.family == "DQN":
-        return StepProbe(seeds, plan.tasks)
-    return Probe(seeds, plan.tasks, plan.metrics)

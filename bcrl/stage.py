@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import ClassVar, Protocol
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.envs import Env
+from bcrl.pack import storable
+from bcrl.q import ZERO
 from bcrl.rollout import Policy
 from bcrl.transfer import Learned, Start, Transfer, begin
 
@@ -25,11 +27,18 @@ class Team:
 
 
 @dataclass(frozen=True)
-class Snapshot:
-    """What a team knows at one moment of a stage."""
+class Pause:
+    """A moment at which learning may be interrupted and gone on with later."""
 
     stage: Stage
     count: int  # iterations or environment steps, over the whole run
+    state: Callable[[], Any]  # what the learner needs besides the stage and its start
+
+
+@dataclass(frozen=True)
+class Snapshot(Pause):
+    """What a team knows at one moment of a stage."""
+
     last_of_stage: bool
     learned: Learned
 
@@ -64,8 +73,14 @@ class Learner(Protocol):
     def length(self) -> int:
         """Iterations or environment steps that a stage takes."""
 
-    def learn(self, stage: Stage, start: Start, team: Team) -> Iterator[Snapshot]:
-        """Learn `stage` from `start`, yielding whenever there is something to see."""
+    def learn(
+        self, stage: Stage, start: Start, team: Team, state: Any = None
+    ) -> Iterator[Pause]:
+        """Learn `stage` from `start`, yielding whenever there is something to see.
+
+        The last pause is a snapshot. `state`: a pause's, to go on from it; what comes
+        is then the same as if there had been no interruption.
+        """
 
 
 @dataclass(frozen=True)
@@ -80,11 +95,65 @@ class Stage:
     before: int  # iterations or environment steps of the stages before
 
 
+@storable
+@dataclass(frozen=True)
+class Past:
+    """Where a run is: how many stages are done, what they left, and the next's state.
+
+    It refers to what is being learned, so store it before learning goes on.
+    """
+
+    stages: int
+    learned: Learned | None
+    state: Any = None
+
+
+class Course:
+    """Stages learned in order, each started by its transfers from the one before."""
+
+    def __init__(
+        self, stages: Sequence[Stage], team: Team, past: Past | None = None
+    ) -> None:
+        self.stages, self.team = stages, team
+        self._past = past or Past(0, None)
+        self._now: Pause | None = None
+
+    def __iter__(self) -> Iterator[Pause]:
+        done, learned, state = self._past.stages, self._past.learned, self._past.state
+        for stage in self.stages[done:]:
+            start = begin(stage.transfers, learned)
+            for now in stage.learner.learn(stage, start, self.team, state):
+                self._now = now
+                yield now
+            learned, state, done = now.learned, None, done + 1
+            self._past = Past(done, learned)
+
+    @property
+    def past(self) -> Past:
+        """All that it takes to go on from the latest pause."""
+        now = self._now
+        if now is None:
+            return self._past
+        if isinstance(now, Snapshot) and now.last_of_stage:
+            return Past(now.stage.number, now.learned)
+        return replace(self._past, state=now.state())
+
+    @property
+    def given(self) -> list[Any]:
+        """What a stored `past` refers to: settings and environments, the team."""
+        settings = (
+            part
+            for stage in self.stages
+            for part in (stage.env, *vars(stage.learner).values())
+        )
+        return [ZERO, self.team, *settings]
+
+
+def snapshots(pauses: Iterable[Pause]) -> Iterator[Snapshot]:
+    """Those of the pauses at which there is something to see."""
+    return (now for now in pauses if isinstance(now, Snapshot))
+
+
 def learn(stages: Sequence[Stage], team: Team) -> Iterator[Snapshot]:
-    """Learn the stages in order, each started by its transfers from the one before."""
-    learned = None
-    for stage in stages:
-        start = begin(stage.transfers, learned)
-        for now in stage.learner.learn(stage, start, team):
-            yield now
-        learned = now.learned
+    """The snapshots of a whole course."""
+    return snapshots(Course(stages, team))

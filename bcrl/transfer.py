@@ -11,9 +11,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from bcrl.errors import ConfigError, at_least
+from bcrl.pack import storable
 from bcrl.q import ZERO, Q, Shaped, add, remembered
 
 
+@storable
 @dataclass(frozen=True)
 class Learned:
     """What a stage leaves behind."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import shlex
 from argparse import Namespace
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -44,9 +46,23 @@ Folders = tuple[str, ...]  # of configs, besides our own
 def plans(arguments: Namespace) -> list[Plan]:
     """The checked plan of each job that this command line asks for."""
     folders, jobs = _composed(arguments)
-    planned = [plan(job, job.hydra.runtime.choices, folders) for job in jobs]
+    planned = [
+        replace(plan(job, job.hydra.runtime.choices, folders), command=_command(job))
+        for job in jobs
+    ]
     _refuse_collisions(planned)
     return planned
+
+
+def _command(job: DictConfig) -> str:
+    """The command that runs one job alone."""
+    asked = job.hydra.overrides
+    words = ["bcrl", *asked.task, *asked.hydra]
+    if job.hydra.job.config_name != CONFIG_NAME:
+        words += ["--config-name", job.hydra.job.config_name]
+    if job.hydra.runtime.choices.get("experiment"):
+        words.append("hydra.mode=RUN")  # this job of its sweep, not all
+    return shlex.join(words)
 
 
 def left_to_hydra(arguments: Namespace) -> bool:

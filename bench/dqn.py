@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.evaluation import evaluate
 from bcrl.learners.dqn import DQN
-from bcrl.stage import Moment, Stage, Team
+from bcrl.stage import Moment, Stage, Team, snapshots
 from bcrl.transfer import Start
 
 ENV, STEPS, FILL = LinearSystem(), 1000, 600
@@ -77,7 +77,8 @@ def lockstep(n_seeds: int) -> Iterator[Moment]:
     """Many seeds, STEPS steps at each `next`."""
     learner = DQN(steps=10**9, evaluate_every=STEPS)
     stage = Stage(1, 1, ENV, learner, (), 0)
-    return learner.learn(stage, Start(), Team(tuple(range(n_seeds)), np.zeros((1, 4))))
+    team = Team(tuple(range(n_seeds)), np.zeros((1, 4)))
+    return snapshots(learner.learn(stage, Start(), team))
 
 
 def main() -> None:

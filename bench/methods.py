@@ -44,23 +44,26 @@ def running(plan: Plan, seeds: tuple[int, ...]) -> Lockstep:
         learned = now.learned
     last = plan.stages[-1]
     run = Lockstep(last.learner, last, begin(last.transfers, learned), team)
-    for step in range(last.learner.replay_size):
-        run.act(step)
-    run.update(0)  # compiled
+    for _ in range(last.learner.replay_size):
+        run.act()
+        run.end_step()
+    run.act()
+    run.update()  # compiled
+    run.end_step()
     return run
 
 
 def cost(run: Lockstep) -> tuple[float, float]:
     """Seconds of CPU of a step with its update, and of an evaluation a step."""
-    first, n = run.replay.added, len(run.team.seeds)
+    n = len(run.team.seeds)
     began = time.process_time()
-    for step in range(first, first + STEPS):
-        run.act(step)
-        run.update(step)
-        run.copy_target()
+    for _ in range(STEPS):
+        run.act()
+        run.update()
+        run.end_step()
     stepping = (time.process_time() - began) / STEPS / n
     began = time.process_time()
-    evaluate(run.moment(first + STEPS), run.team.seeds)
+    evaluate(run.moment(), run.team.seeds)
     every = run.settings.evaluate_every
     return stepping, (time.process_time() - began) / every / n
 

@@ -17,6 +17,7 @@ from bcrl.policies import annealed
 from bcrl.q import Table
 from bcrl.q.mlp import Networks
 from bcrl.replay import Replay
+from bcrl.stage import snapshots
 from bcrl.streams import stream
 from bcrl.transfer import (
     Boost,
@@ -51,7 +52,8 @@ def one_thread():
 
 
 def learn(settings, start=None, env=TARGET, seeds=(0,), number=1):
-    return settings.learn(staged(settings, env, number), start or Start(), team(*seeds))
+    stage = staged(settings, env, number)
+    return snapshots(settings.learn(stage, start or Start(), team(*seeds)))
 
 
 def weights(moment):
@@ -69,7 +71,7 @@ def marked(replay, i):
 
 
 def test_the_replay_overwrites_the_oldest():
-    replay = Replay(3, 10, 2, 2, "cpu")
+    replay = Replay.empty(3, 10, 2, 2, "cpu")
     for i in range(27):
         marked(replay, i)
         assert replay.size == min(i + 1, 10)
@@ -78,7 +80,7 @@ def test_the_replay_overwrites_the_oldest():
 
 
 def test_a_sample_is_the_rows_asked_for():
-    replay = Replay(3, 10, 2, 2, "cpu")
+    replay = Replay.empty(3, 10, 2, 2, "cpu")
     for i in range(14):
         marked(replay, i)
     at = np.random.default_rng(0).integers(10, size=(3, 6))
@@ -100,7 +102,7 @@ def test_a_sample_is_the_rows_asked_for():
 
 @pytest.mark.parametrize("already", [0, 4, 9, 30])
 def test_places_are_uniform_over_what_will_be_held(already):
-    replay = Replay(2, 10, 2, 2, "cpu")
+    replay = Replay.empty(2, 10, 2, 2, "cpu")
     for i in range(already):
         marked(replay, i)
     u = np.random.default_rng(1).random((15, 2, 400))
@@ -132,9 +134,10 @@ def test_epsilon_is_how_often_it_explores():
     settings = replace(TINY, random_steps=300, steps=300, learning_starts=10_000)
     run = Lockstep(settings, staged(settings, TARGET), Start(), team(0))
     best = []
-    for step in range(600):
+    for _ in range(600):
         best.append(int(run.deep(run.state[:, None], 8)[0, 0].argmax()))
-        run.act(step)
+        run.act()
+        run.end_step()
     action = run.replay.rows[0, :600, -1].numpy().astype(int)
     same = action == np.array(best)
     assert same[:300].mean() == pytest.approx(1 / 8, abs=0.06)
@@ -177,7 +180,7 @@ def test_the_target_is_copied_every_few_steps_random_ones_counted():
 def test_moments_come_before_the_first_step_and_then_regularly():
     settings = replace(TINY, steps=50, evaluate_every=20)
     stage = staged(settings, TARGET, before=2000)
-    found = list(settings.learn(stage, Start(), team(0)))
+    found = list(snapshots(settings.learn(stage, Start(), team(0))))
     assert [m.count for m in found] == [2010, 2030, 2050, 2060]
     assert [m.last_of_stage for m in found] == [False, False, False, True]
 
@@ -189,7 +192,7 @@ def known(best, n=6):
     """A table that prefers `best` by 100 in each of the corridor's cells."""
     values = np.zeros((n, 2))
     values[:, best] = 100.0
-    return Table([values], Corridor().index)
+    return Table([values], Corridor())
 
 
 @pytest.mark.parametrize("best", [0, 1])
@@ -206,10 +209,11 @@ def test_acting_and_evaluating_are_greedy_on_the_sum_or_on_the_residual(
     expected = np.full(6, best) if greedy_on == "sum" else own
     for step in range(40):
         cell = int(run.state[0, 0])
-        run.act(step)
+        run.act()
+        run.end_step()
         assert run.replay.rows[0, step, -1] == expected[cell]
     lanes = np.tile(every, (1, 1, 1))[:, :4]
-    found = run.moment(0).policy(lanes, np.full((1, 4, 3), 0.5), np.ones((1, 4), bool))
+    found = run.moment().policy(lanes, np.full((1, 4, 3), 0.5), np.ones((1, 4), bool))
     assert found[0, 2:].tolist() == expected[2:4].tolist()  # the greedy half
 
 
@@ -329,7 +333,7 @@ def test_a_loss_that_is_no_number_fails_its_seed_though_its_weights_are():
     run = Lockstep(TINY, staged(TINY, TARGET), Start(), team(0, 1, 2))
     run.loss[1], run.loss[2] = np.nan, np.inf
     run.updates = 1
-    assert run.moment(1).failed == {1: "non-finite loss", 2: "non-finite loss"}
+    assert run.moment().failed == {1: "non-finite loss", 2: "non-finite loss"}
 
 
 def test_one_seeds_weights_that_fail_leave_the_others_alone():
@@ -361,7 +365,7 @@ def test_it_learns_to_walk_the_corridor(transfers):
     start = Start()
     if transfers:  # the first task's Q goes the wrong way
         values = np.linspace(0.0, 1.0, 6)[:, None] + [3.0, 0.0]
-        prior = Table([values, values], env.index)
+        prior = Table([values, values], env)
         start = begin(transfers, Learned(prior, prior))
     first, *_, final = (
         (moment, evaluate(moment, (0, 1)))

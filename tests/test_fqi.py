@@ -72,7 +72,7 @@ def test_boosting_learns_the_difference_between_two_tasks():
 
 
 def test_a_boosted_stage_starts_at_the_previous_q_and_a_zero_residual():
-    q, residual = (Table([np.full((6, 2), x)], Corridor().index) for x in (2.0, 1.0))
+    q, residual = (Table([np.full((6, 2), x)], Corridor()) for x in (2.0, 1.0))
     previous = Learned(q, residual)
     boosted = begin([Boost()], previous)
     assert boosted.base is q and boosted.initial is ZERO
@@ -160,7 +160,7 @@ def test_the_released_option_shares_one_dataset_a_task():
 
 
 def test_sums_flatten_and_drop_zeros():
-    a, b = Table([np.ones((6, 2))], Corridor().index), Table([np.ones((6, 2))], None)
+    a, b = Table([np.ones((6, 2))], Corridor()), Table([np.ones((6, 2))], None)
     assert add(ZERO, a) is a and isinstance(add(ZERO, ZERO), Zero)
     assert add(add(a, b), a) == Sum((a, b, a))
     states = [np.array([[1.0], [2.0]])]

@@ -38,13 +38,13 @@ def networks(hidden, seeds, purpose="weights"):
 def learner(hidden, seeds, rate=1e-4):
     """Networks whose target differs from the online ones."""
     online = networks(hidden, seeds)
-    optimiser = Adam(online.flat, rate)
+    optimiser = Adam.of(online.flat, rate)
     return DeepQ(online, networks(hidden, seeds, "trees"), optimiser, 0)
 
 
 def filled(seeds, n=200, capacity=200):
     """A replay of random rows, each seed's own; a tenth of them absorbing."""
-    replay, parts = Replay(len(seeds), capacity, D, A, "cpu"), []
+    replay, parts = Replay.empty(len(seeds), capacity, D, A, "cpu"), []
     for seed in seeds:
         rng = stream(seed, "data")
         parts.append(
@@ -282,7 +282,7 @@ def test_faded_moments_become_zero_and_not_denormal():
     rng = np.random.default_rng(0)
     parameters = rng.standard_normal((1, n)).astype(np.float32)
     first, second = np.zeros((2, 1, n), np.float32)
-    optimiser = Adam(torch.zeros(1, n), 1e-4)
+    optimiser = Adam.of(torch.zeros(1, n), 1e-4)
     exact = [parameters.astype(float), np.zeros((1, n)), np.zeros((1, n))]
     gradient = np.zeros((1, 64), np.float32)  # tiles read beyond n
     gradient[:, :n] = 10.0 ** rng.uniform(-14, 0, n)

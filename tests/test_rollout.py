@@ -19,7 +19,7 @@ def play(env, q, epsilon, seeds=(0, 1), episodes=7):
 def tables(env, seeds=2):
     rng = np.random.default_rng(1)
     values = rng.integers(3, size=(seeds, len(env.states()), env.n_actions)) * 1.0
-    return Table(list(values), env.index)  # small integers: many ties
+    return Table(list(values), env)  # small integers: many ties
 
 
 def test_the_tabular_walk_equals_the_general_rollout():
@@ -37,8 +37,8 @@ def test_a_seed_plays_alone_as_it_does_among_others():
     env = Maze(0.05)
     rng = np.random.default_rng(2)
     values = [rng.random((441, 4)) for _ in range(3)]
-    together = play(env, Table(values, env.index), 0.2, seeds=(0, 1, 2))
-    alone = play(env, Table(values[2:], env.index), 0.2, seeds=(2,))
+    together = play(env, Table(values, env), 0.2, seeds=(0, 1, 2))
+    alone = play(env, Table(values[2:], env), 0.2, seeds=(2,))
     assert np.array_equal(together.state[2], alone.state[0])
 
 
@@ -52,7 +52,7 @@ def test_epsilon_one_never_asks_for_values():
 
 def test_exploration_happens_at_rate_epsilon():
     env = Corridor()
-    right = Table([np.tile([0.0, 1.0], (6, 1))] * 2, env.index)
+    right = Table([np.tile([0.0, 1.0], (6, 1))] * 2, env)
     played = play(env, right, 0.5, episodes=2000)
     live = np.arange(env.horizon) < played.length[..., None]
     assert abs((played.action[live] == 1).mean() - 0.75) < 0.02
@@ -60,7 +60,7 @@ def test_exploration_happens_at_rate_epsilon():
 
 def test_discounted_return_by_hand():
     env = Corridor(prize=2.0, gamma=0.5)
-    right = Table([np.tile([0.0, 1.0], (6, 1))], env.index)
+    right = Table([np.tile([0.0, 1.0], (6, 1))], env)
     u = draws(stream(0, "evaluation"), env, 1)[None]
     played = rollout(env, right, np.full((1, 1, 1), 3.0), u)
     assert played.length.tolist() == [[2]]

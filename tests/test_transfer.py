@@ -466,7 +466,7 @@ def test_shaping_shifts_q_by_minus_v_and_keeps_the_greedy_policy(seed):
     shaped = value_iteration(index, reward + extra, absorbing, env.gamma)
     assert np.allclose(shaped, plain - v[:, None], atol=1e-9)
     assert np.array_equal(shaped.argmax(1), plain.argmax(1))
-    tables = (Table([t], env.index) for t in (shaped, np.repeat(v[:, None], 2, 1)))
+    tables = (Table([t], env) for t in (shaped, np.repeat(v[:, None], 2, 1)))
     assert np.allclose(Shaped(ZERO, *tables)([env.states()], 2)[0], plain, atol=1e-9)
 
 

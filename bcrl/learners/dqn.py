@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from threadpoolctl import threadpool_limits
 
 from bcrl.learners.lockstep import Lockstep
 from bcrl.policies import annealed
-from bcrl.stage import Moment, Stage, Team
+from bcrl.stage import Pause, Stage, Team
 from bcrl.transfer import Start
 
 
@@ -53,16 +53,27 @@ class DQN:
             return 1.0
         return annealed(trained, self.epsilon_start, self.epsilon, self.anneal_steps)
 
-    def learn(self, stage: Stage, start: Start, team: Team) -> Iterator[Moment]:
-        """Learn a stage; yields before the first step and every `evaluate_every`."""
+    def is_evaluated(self, step: int) -> bool:
+        """Whether there is something to see after `step` steps of a stage."""
+        trained = step - self.random_steps
+        due = trained >= 0 and trained % self.evaluate_every == 0
+        return due or step == self.length
+
+    def learn(
+        self, stage: Stage, start: Start, team: Team, state: Any = None
+    ) -> Iterator[Pause]:
+        """Learn a stage; yields before the first step and after each.
+
+        There is a moment to see before the first that isn't random, after every
+        `evaluate_every` and after the last.
+        """
         with threadpool_limits(1):  # what there is for BLAS is too little for more
-            run = Lockstep(self, stage, start, team)
-            for step in range(self.length):
-                trained = step - self.random_steps
-                if trained >= 0 and trained % self.evaluate_every == 0:
-                    yield run.moment(step)
-                run.act(step)
+            run = Lockstep(self, stage, start, team, state)
+            if state is None:
+                yield run.pause()
+            while run.step < self.length:
+                run.act()
                 if run.replay.size > self.learning_starts:
-                    run.update(step)
-                run.copy_target()
-            yield run.moment(self.length)
+                    run.update()
+                run.end_step()
+                yield run.pause()

@@ -5,16 +5,15 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bcrl import data, rollout
 from bcrl.bellman import residual_target, shaping
 from bcrl.envs import is_finite
-from bcrl.q import ZERO, Fits, Table, Values
-from bcrl.q.regressors import Fit, Problem, Regressor
+from bcrl.q import ZERO, Table, Values
+from bcrl.q.regressors import Fits, Fitted, Problem, Regressor
 from bcrl.stage import Snapshot, Stage, Team
 from bcrl.streams import stream
 from bcrl.transfer import Learned, Start
@@ -53,12 +52,15 @@ class FQI:
         """Iterations of a stage."""
         return self.iterations
 
-    def learn(self, stage: Stage, start: Start, team: Team) -> Iterator[Iteration]:
+    def learn(
+        self, stage: Stage, start: Start, team: Team, state: Any = None
+    ) -> Iterator[Iteration]:
         """Learn a stage, ϱ ← S(T(base + ϱ) − base); yields after each iteration."""
-        sets = self._data(stage, start, team)
+        done, sets, residual = state or (0, self._data(stage, start, team), None)
         env, points = stage.env, [d.points for d in sets]
         base = start.base(points, env.n_actions)
-        residual = start.initial(points, env.n_actions)
+        if residual is None:
+            residual = start.initial(points, env.n_actions)
         lift = [v.max(-1) for v in start.potential(points, env.n_actions)]
         rewards = [
             d.reward + shaping(v[d.state], v[d.next_state], d.absorbing, env.gamma)
@@ -69,29 +71,31 @@ class FQI:
             if isinstance(start.initial, Fits)
             else [[None] * env.n_actions for _ in sets]
         )
-        predict = functools.partial(_predict, self.regressor, team.threads)
         # With noise no state comes twice; the next stage's base should not remember.
         evaluated = start if env.step_noise else start.remembered()
-        for k in range(1, self.iterations + 1):
+        for k in range(done + 1, self.iterations + 1):
             residual = [values.copy() for values in residual]
-            fits = self._fit(stage, k, team, rewards, sets, base, residual)
-            for (s, a), fit in fits.items():
+            problems = self._problems(stage, k, team, rewards, sets, base, residual)
+            keep = not is_finite(env)  # a table is never asked between its points
+            fits = self.regressor.fit(list(problems.values()), keep, team.threads)
+            for ((s, a), problem), fit in zip(problems.items(), fits, strict=True):
                 part = sets[s].by_action[a]
                 residual[s][sets[s].state[part.rows], a] = fit.fitted
                 residual[s][part.query_points, a] = fit.queried
-                models[s][a] = fit.model
+                models[s][a] = Fitted.of(problem, fit)
             q = [b + r for b, r in zip(base, residual, strict=True)]
             if start.shape is not None:
                 q = [x + v[:, None] for x, v in zip(q, lift, strict=True)]
             if is_finite(env):
-                learned = Learned(Table(q, env.index), Table(residual, env.index), sets)
+                learned = Learned(Table(q, env), Table(residual, env), sets)
             else:
-                own = Fits([tuple(row) for row in models], predict)
+                own = Fits([tuple(row) for row in models], self.regressor, team)
                 whole = start if k == self.iterations else evaluated
                 learned = Learned(whole.whole(own), own, sets)
             yield Iteration(
                 stage,
                 stage.before + k,
+                functools.partial(_state, k, sets, residual),
                 k == self.iterations,
                 learned,
                 [values[d.probe] for values, d in zip(q, sets, strict=True)],
@@ -115,7 +119,7 @@ class FQI:
         sets = [data.build(env, played, s, team.probe) for s in range(len(rngs))]
         return sets * len(team.seeds) if self.shared_data else sets
 
-    def _fit(
+    def _problems(
         self,
         stage: Stage,
         k: int,
@@ -124,8 +128,8 @@ class FQI:
         sets: list[data.Dataset],
         base: Values,
         residual: Values,
-    ) -> dict[tuple[int, int], Fit]:
-        """Iteration k's fits by (seed, action); an action never tried has none."""
+    ) -> dict[tuple[int, int], Problem]:
+        """Iteration k's regressions by (seed, action); none for an untried action."""
         problems: dict[tuple[int, int], Problem] = {}
         for s, d in enumerate(sets):
             q = base[s] + residual[s]
@@ -144,14 +148,12 @@ class FQI:
                         y[part.rows],
                         part.multiplicity,
                         part.queries,
-                        stream(team.seeds[s], "trees", *path),
+                        team.seeds[s],
+                        path,
                     )
-        keep = not is_finite(stage.env)  # a table is never asked between its points
-        fits = self.regressor.fit(list(problems.values()), keep, team.threads)
-        return dict(zip(problems, fits, strict=True))
+        return problems
 
 
-def _predict(
-    regressor: Regressor, threads: int, models: list, x: list[NDArray]
-) -> list[NDArray[np.float64]]:
-    return regressor.predict(models, x, threads)
+def _state(k: int, sets: list[data.Dataset], residual: Values) -> tuple:
+    """What FQI needs to go on after iteration k: no model, the next fits anew."""
+    return k, sets, residual

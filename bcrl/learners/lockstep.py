@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -15,50 +15,68 @@ from bcrl.q import Q
 from bcrl.q.mlp import Adam, DeepQ, Networks, xavier
 from bcrl.replay import Replay
 from bcrl.rollout import CHOICES, Policy
-from bcrl.stage import Moment, Stage, Team
+from bcrl.stage import Moment, Pause, Stage, Team
 from bcrl.streams import stream
 from bcrl.transfer import Learned, PolicyReuse, ResidualPolicy, Start
 
 if TYPE_CHECKING:
     from bcrl.learners.dqn import DQN
 
+CHANGING = (
+    *("step", "deep", "replay", "ahead", "state", "steps_in_episode", "decisions"),
+    *("loss", "updates"),
+)
 BLOCK = 500  # steps whose uniforms are drawn at a time, from a stream of their own
 
 
 class Lockstep:
     """S seeds, each with its environment, replay, networks and streams."""
 
-    def __init__(self, settings: DQN, stage: Stage, start: Start, team: Team) -> None:
+    def __init__(
+        self,
+        settings: DQN,
+        stage: Stage,
+        start: Start,
+        team: Team,
+        saved: dict[str, Any] | None = None,
+    ) -> None:
         self.settings, self.stage, self.start, self.team = settings, stage, start, team
-        self.env, n = stage.env, len(team.seeds)
-        self.deep = self._networks()
-        self.replay = Replay(
-            n,
-            settings.replay_size,
-            self.env.state_dim,
-            self.env.n_actions,
-            team.device,
-        )
+        self.env = stage.env
+        for name, value in (saved or self._fresh()).items():
+            setattr(self, name, value)
         self._gradient_step = updater(self.deep, self.replay)
-        self._ahead: NDArray | None = None  # ϱ's values at the state, if known
         self.table = (
             combined(self.env.actions)
             if isinstance(start.steering, ResidualPolicy)
             else None
         )
-        begin = np.stack(
-            [
-                stream(seed, "exploration", stage.number).random(self.env.initial_noise)
-                for seed in team.seeds
-            ]
-        )
-        self.state = self.env.initial(begin)  # (S, d)
         self.known = self._known(self.state)
-        self.steps_in_episode = np.zeros(n, np.intp)
-        self.decisions = np.zeros(n, np.intp)  # that were not random, for RPL's offset
-        self._all = np.arange(n)
-        self.loss = np.zeros(n)  # summed over the updates since the last moment
-        self.updates = 0
+        self._all = np.arange(len(team.seeds))
+        self._drawn: int | None = None  # the block whose uniforms are at hand
+
+    def _fresh(self) -> dict[str, Any]:
+        """All that changes from step to step, before the first."""
+        env, seeds, number = self.env, self.team.seeds, self.stage.number
+        n = len(seeds)
+        begin = np.stack(
+            [stream(s, "exploration", number).random(env.initial_noise) for s in seeds]
+        )
+        shape = (n, self.settings.replay_size, env.state_dim, env.n_actions)
+        return {
+            "step": 0,  # steps done
+            "deep": self._networks(),
+            "replay": Replay.empty(*shape, self.team.device),
+            "ahead": None,  # ϱ's values at the state, if known
+            "state": env.initial(begin),  # (S, d)
+            "steps_in_episode": np.zeros(n, np.intp),
+            "decisions": np.zeros(n, np.intp),  # not random ones, for RPL's offset
+            "loss": np.zeros(n),  # summed over the updates since the last moment
+            "updates": 0,
+        }
+
+    def saved(self) -> dict[str, Any]:
+        """What `_fresh` names, as it is now: enough to go on exactly."""
+        return {name: getattr(self, name) for name in CHANGING}
 
     def _networks(self) -> DeepQ:
         """Those of the previous stage, or new ones with the target equal to online."""
@@ -71,7 +89,7 @@ class Lockstep:
         ]
         flat = torch.from_numpy(np.stack(drawn)).to(self.team.device)
         online = Networks(sizes, flat)
-        optimiser = Adam(flat, self.settings.learning_rate)
+        optimiser = Adam.of(flat, self.settings.learning_rate)
         return DeepQ(online, online.clone(), optimiser)
 
     def _ask(self, states: NDArray, *frozen: Q) -> dict[int, NDArray]:
@@ -85,11 +103,11 @@ class Lockstep:
         values = self._ask(state[:, None], start.base, start.potential, start.prior)
         return {key: each[:, 0] for key, each in values.items()}
 
-    def act(self, step: int) -> None:
+    def act(self) -> None:
         """One step of every seed's environment, into its replay."""
-        env, start = self.env, self.start
+        env, start, step = self.env, self.start, self.step
         u = self._draws(step)
-        values = self._ahead
+        values = self.ahead
         if values is None:
             values = self.deep(self.state[:, None], env.n_actions)[:, 0]
         own_values = self._whole(values, self.known[id(start.base)])
@@ -126,7 +144,7 @@ class Lockstep:
     def _draws(self, step: int) -> NDArray[np.float64]:
         """All uniforms of one step, (S, CHOICES + step_noise + initial_noise)."""
         block, at = divmod(step, BLOCK)
-        if at == 0:
+        if block != self._drawn:
             env, number = self.env, self.stage.number
             shape = (BLOCK, CHOICES + env.step_noise + env.initial_noise)
             batches = (BLOCK, self.settings.batch_size)
@@ -135,7 +153,8 @@ class Lockstep:
                 drawn.append(stream(seed, "exploration", number, block).random(shape))
                 picked.append(stream(seed, "replay", number, block).random(batches))
             self._block = np.stack(drawn, 1)
-            self._places = self.replay.places(np.stack(picked, 1))
+            self._places = self.replay.places(np.stack(picked, 1), at)
+            self._drawn = block
         return self._block[at]
 
     def _whole(self, values: NDArray, base: NDArray) -> NDArray[np.float64]:
@@ -190,26 +209,33 @@ class Lockstep:
             shape.zero_at_goal,
         )
 
-    def update(self, step: int) -> None:
+    def update(self) -> None:
         """One gradient step of every seed on a batch of its own."""
-        at, target_update = step % BLOCK, self.settings.target_update
+        at, target_update = self.step % BLOCK, self.settings.target_update
         since = self.deep.steps % target_update
         batches = 1 if at and since else target_update - since  # till the target's next
-        loss, self._ahead = self._gradient_step(
+        loss, self.ahead = self._gradient_step(
             self._places[at : at + batches], self.state
         )
         self.loss += loss
         self.updates += 1
 
-    def copy_target(self) -> None:
+    def end_step(self) -> None:
         """Count a step; every `target_update` steps the target becomes the online."""
+        self.step += 1
         self.deep.steps += 1
         if self.deep.steps % self.settings.target_update == 0:
             self.deep.copy_target()
             self.replay.forget()
 
-    def moment(self, step: int) -> Moment:
-        """What there is to see after `step` steps of the stage."""
+    def pause(self) -> Pause:
+        """The step's end, with what there is to see if it is time to evaluate."""
+        if self.settings.is_evaluated(self.step):
+            return self.moment()
+        return Pause(self.stage, self.stage.before + self.step, self.saved)
+
+    def moment(self) -> Moment:
+        """What there is to see now."""
         lost = ~torch.isfinite(self.deep.online.flat).all(1).cpu().numpy()
         failed = {int(s): "non-finite weights" for s in np.flatnonzero(lost)}
         for s in np.flatnonzero(~np.isfinite(self.loss)):
@@ -218,22 +244,24 @@ class Lockstep:
         self.loss, self.updates = np.zeros_like(loss), 0
         return Moment(
             self.stage,
-            self.stage.before + step,
-            step == self.settings.length,
+            self.stage.before + self.step,
+            self.saved,
+            self.step == self.settings.length,
             Learned(self.start.whole(self.deep), self.deep),
-            self._policy(step),
+            self._policy(),
             self.settings.evaluation_episodes,
             loss,
             failed,
         )
 
-    def _policy(self, step: int) -> Policy:
+    def _policy(self) -> Policy:
         """This moment's policy: half of the lanes explore, the others are greedy.
 
         The greedy ones reuse nothing of the prior (PPR).
         """
         halves = np.repeat([1.0, 0.0], self.settings.evaluation_episodes)
         epsilon, reuse = self.settings.evaluation_epsilon * halves, halves > 0
+        step = self.step
 
         def policy(now: NDArray, u: NDArray, alive: NDArray) -> NDArray:
             frozen = self._ask(now, self.start.base, self.start.prior)

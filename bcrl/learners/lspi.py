@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,13 +43,17 @@ class LSPI:
         """Environment steps of a stage."""
         return self.iterations * self.episodes * self.horizon
 
-    def learn(self, stage: Stage, start: Start, team: Team) -> Iterator[Moment]:
+    def learn(
+        self, stage: Stage, start: Start, team: Team, state: Any = None
+    ) -> Iterator[Moment]:
         """Learn an LQ task; yields before the first and after each iteration."""
         env, n = stage.env, len(team.seeds)
         k = env.actions.shape[1]
-        gain, q = np.zeros((n, k, env.state_dim)), ZERO
         failed: dict[int, str] = {}
-        for iteration in range(self.iterations + 1):
+        done, gain, q = -1, np.zeros((n, k, env.state_dim)), ZERO
+        if state is not None:
+            done, gain, q, failed = state
+        for iteration in range(done + 1, self.iterations + 1):
             if iteration:
                 z, after, reward = self._collect(stage, gain, iteration, team)
                 theta = [
@@ -66,21 +70,23 @@ class LSPI:
                         why = f"LSPI found no stabilising gain in iteration {iteration}"
                         failed.setdefault(s, why)
                     gain[s] = 0.0 if found is None else found
-            yield self._moment(stage, iteration, q, gain.copy(), failed)
+            yield self._moment(stage, (iteration, gain.copy(), q, dict(failed)))
 
     def _moment(
-        self, stage: Stage, iteration: int, q: Q, gain: NDArray, failed: dict[int, str]
+        self, stage: Stage, state: tuple[int, NDArray, Q, dict[int, str]]
     ) -> Moment:
+        iteration, gain, q, failed = state
         policy = _linear(gain)  # evaluated without noise, so greedy is the same
         return Moment(
             stage,
             stage.before + iteration * self.length // self.iterations,
+            lambda: state,
             iteration == self.iterations,
             Learned(q, q),
             policy,
             self.evaluation_episodes,
             np.full(len(gain), np.nan),
-            dict(failed),
+            failed,
         )
 
     def _collect(

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from bcrl.envs import Env
+from bcrl.pack import storable
 
 Values = Sequence[NDArray[np.float64]]
 
@@ -40,6 +43,7 @@ class Zero:
 ZERO = Zero()
 
 
+@storable
 @dataclass(frozen=True)
 class Sum:
     """The sum of Q-functions: a frozen base and the residuals learned on it."""
@@ -56,6 +60,7 @@ class Sum:
         return total
 
 
+@storable
 @dataclass(frozen=True)
 class Shaped:
     """base + ϱ + max_a' potential(s, a'): undoes what shaping took off the rewards.
@@ -115,35 +120,13 @@ def remembered(q: Q) -> Q:
     return q if q is ZERO else Remembered(q)
 
 
+@storable
 @dataclass(frozen=True)
 class Table:
     """Tabulated Q of a finite environment: one array (N, A) a seed."""
 
     values: Sequence[NDArray[np.float64]]
-    index: Callable[[NDArray[np.float64]], NDArray[np.intp]]
+    env: Env
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        return each(states, lambda s: self.values[s][self.index(states[s])])
-
-
-@dataclass(frozen=True)
-class Fits:
-    """One fitted model per seed and action; an action never seen predicts 0 (None)."""
-
-    models: Sequence[Sequence[Any | None]]
-    predict: Callable[[list[Any], list[NDArray[np.float64]]], list[NDArray[np.float64]]]
-
-    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        cells = [
-            (s, a)
-            for s, row in enumerate(self.models)
-            for a, model in enumerate(row)
-            if model is not None and len(states[s])
-        ]
-        out = [np.zeros((len(x), n_actions)) for x in states]
-        found = self.predict(
-            [self.models[s][a] for s, a in cells], [states[s] for s, _ in cells]
-        )
-        for (s, a), values in zip(cells, found, strict=True):
-            out[s][:, a] = values
-        return np.stack(out) if isinstance(states, np.ndarray) else out
+        return each(states, lambda s: self.values[s][self.env.index(states[s])])

@@ -9,12 +9,13 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from bcrl.pack import DERIVED, storable
 from bcrl.q import Values, compiled, each
 from bcrl.q.tiles import FADED
 
@@ -39,6 +40,8 @@ def xavier(
     return np.concatenate(parts).astype(np.float32)
 
 
+@storable
+@dataclass(eq=False)
 class Networks:
     """S perceptrons with ReLU, their parameters the rows of one buffer `flat` (S, P).
 
@@ -46,10 +49,14 @@ class Networks:
     is shared between seeds, and no result depends on how many there are.
     """
 
-    def __init__(self, sizes: Sequence[int], flat: Tensor) -> None:
-        self.sizes, self.flat = tuple(sizes), flat
-        self.layers = self._views(flat)
-        self._buffers: dict[int, list[Tensor]] = {}
+    sizes: tuple[int, ...]
+    flat: Tensor
+    _buffers: dict[int, list[Tensor]] = field(
+        default_factory=dict, repr=False, metadata=DERIVED
+    )
+
+    def __post_init__(self) -> None:
+        self.layers = self._views(self.flat)
 
     def _views(self, flat: Tensor) -> list[tuple[Tensor, Tensor]]:
         """(weights (S, in, out), biases (S, 1, out)) of each layer, inside `flat`."""
@@ -104,25 +111,25 @@ def _mask(slope: Tensor, activation: Tensor) -> None:
     torch.ops.aten.threshold_backward.grad_input(slope, activation, 0, grad_input=slope)
 
 
+@storable
+@dataclass(eq=False)
 class Adam:
     """Adam on a flat buffer (S, P), every seed by itself (Kingma and Ba 2015)."""
 
-    def __init__(
-        self,
-        parameters: Tensor,
-        rate: float,
-        betas: tuple[float, float] = (0.9, 0.999),
-        eps: float = 1e-8,
-    ) -> None:
-        self.rate, self.betas, self.eps = rate, betas, eps
-        self.moments = parameters.new_zeros((2, *parameters.shape))
-        self.steps = 0
+    moments: Tensor  # (2, S, P)
+    rate: float
+    betas: tuple[float, float] = (0.9, 0.999)
+    eps: float = 1e-8
+    steps: int = 0
+
+    @classmethod
+    def of(cls, parameters: Tensor, rate: float) -> Adam:
+        """For parameters (S, P) that have not been trained yet."""
+        return cls(parameters.new_zeros((2, *parameters.shape)), rate)
 
     def clone(self) -> Adam:
         """The same moments and step count in a buffer of their own."""
-        copy = Adam(self.moments[0], self.rate, self.betas, self.eps)
-        copy.moments, copy.steps = self.moments.clone(), self.steps
-        return copy
+        return replace(self, moments=self.moments.clone())
 
     def next_step(self) -> tuple[float, float, float, float, float]:
         """Count a step; β1, β2, the rate and scale that correct the bias, and ε."""
@@ -143,6 +150,7 @@ class Adam:
         parameters.addcdiv_(first, second.sqrt().mul_(scale).add_(eps), value=-rate)
 
 
+@storable
 @dataclass
 class DeepQ:
     """What DQN has learned: the residual as a Q-function, and all it takes to go on."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.arrays import per_lane
+from bcrl.pack import storable
 from bcrl.q import Values
 
 #: products: all z_i z_j, i ≤ j [released]; linear_quadratic: the z_i besides [paper].
@@ -23,6 +24,7 @@ def features(z: NDArray[np.float64], kind: str) -> NDArray[np.float64]:
     return products if kind == "products" else np.concatenate([z, products], -1)
 
 
+@storable
 @dataclass(frozen=True)
 class Quadratic:
     """Q(s, a) = zᵀ M z + lᵀ z with z = (s, a), for S seeds and a table of actions."""

@@ -1,0 +1,107 @@
+"""Checkpoints: what a team of seeds needs to go on exactly where it was interrupted."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from bcrl import pack
+from bcrl.compose import Plan, identity
+from bcrl.errors import BcrlError
+from bcrl.files import write_atomically
+from bcrl.records import LIBRARIES, is_complete
+
+SCHEMA = 1  # raised when the content's meaning changes
+
+Seeds = tuple[int, ...]
+
+
+def save(plan: Plan, seeds: Seeds, content: Any, given: Sequence[Any]) -> None:
+    """Store `content`, which refers to what is `given`, as the team's checkpoint."""
+    about = _about(plan) | {"seeds": list(seeds)}
+    write_atomically(
+        _path(plan, seeds), lambda file: pack.write(file, about, content, given)
+    )
+
+
+def load(plan: Plan, seeds: Seeds, given: Sequence[Any]) -> Any:
+    """The team's stored content; BcrlError if it can't be read."""
+    path = _path(plan, seeds)
+    try:
+        return pack.read(path, given, plan.device)
+    except BcrlError as error:
+        raise _remedy(error) from error
+
+
+def teams(plan: Plan) -> list[Seeds]:
+    """The teams of the plan's seeds that can go on from a checkpoint.
+
+    BcrlError for a file that is none. One of other code or another config counts as
+    absent: what it would lead to is not what an uninterrupted run gives.
+    """
+    asked, here = set(plan.seeds), _about(plan)
+    found = []
+    for about in map(_read_about, _paths(plan)):
+        seeds = tuple(about.pop("seeds", ()))
+        if about == here and asked.issuperset(seeds):
+            found.append(seeds)
+    return found
+
+
+def remove_done(plan: Plan) -> None:
+    """Remove checkpoints all of whose seeds are complete."""
+    for path in _paths(plan):
+        seeds = _read_about(path).get("seeds", ())
+        if all(is_complete(plan.directory, seed) for seed in seeds):
+            path.unlink(missing_ok=True)
+
+
+def _paths(plan: Plan) -> list[Path]:
+    return sorted(plan.directory.glob("checkpoint_*.npz"))
+
+
+def _path(plan: Plan, seeds: Seeds) -> Path:
+    """Named by the first seed, and all of them."""
+    code = hashlib.sha256(repr(seeds).encode()).hexdigest()[:8]
+    return plan.directory / f"checkpoint_{seeds[0]:04d}_{code}.npz"
+
+
+def _read_about(path: Path) -> dict[str, Any]:
+    try:
+        return pack.read_about(path)
+    except BcrlError as error:
+        if not path.exists():  # its team has just ended
+            return {}
+        raise _remedy(error) from error
+
+
+def _remedy(error: BcrlError) -> BcrlError:
+    return BcrlError(f"{error}; remove it, its seeds then start anew")
+
+
+def _about(plan: Plan) -> dict[str, Any]:
+    """What must be the same for a run to go on from a checkpoint."""
+    config = json.dumps(identity(plan.config), sort_keys=True)
+    return {
+        "schema": SCHEMA,
+        "code": _code(),
+        "config": hashlib.sha256(config.encode()).hexdigest(),
+        "device": plan.device,
+    }
+
+
+@cache
+def _code() -> str:
+    """A fingerprint of all that computes: our sources and the libraries' versions."""
+    package = Path(__file__).resolve().parent
+    code = hashlib.sha256()
+    for source in sorted(package.rglob("*.py")):
+        if "report" not in source.relative_to(package).parts:
+            code.update(source.read_bytes())
+    code.update(repr([version(name) for name in LIBRARIES]).encode())
+    return code.hexdigest()
