@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import resource
 import socket
@@ -118,7 +119,8 @@ def _train(
     if resumes:
         stored = checkpoints.load(plan, seeds, course.given)
         course = Course(plan.stages, team, stored["past"])
-        session, probe.kept = Session(**stored["session"]), stored["kept"]
+        rest = stored["session"] | {"rows": json.loads(stored["session"]["rows"])}
+        session, probe.kept = Session(**rest), stored["kept"]
     new = [s for s in seeds if not records.is_complete(plan.directory, s)]
     host = {"host": socket.gethostname(), "pid": os.getpid()}
     for seed in new:
@@ -128,7 +130,10 @@ def _train(
     def save(interrupted: bool) -> None:
         session.wall = before[0] + time.perf_counter() - began
         session.cpu = before[1] + time.process_time() - cpu
-        rest = vars(session) | {"interruptions": session.interruptions + interrupted}
+        rest = vars(session) | {
+            "interruptions": session.interruptions + interrupted,
+            "rows": json.dumps(session.rows),  # many small values, packed at once
+        }
         content = {"past": course.past, "session": rest, "kept": probe.kept}
         _check_locks(plan, held)
         checkpoints.save(plan, seeds, content, course.given)

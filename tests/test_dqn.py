@@ -400,7 +400,7 @@ def test_the_recorded_loss_is_torchs_mean_since_the_last_moment(every):
     picks = [stream(s, "replay", 1, 0).random((BLOCK, 32)) for s in seeds]
     losses, sides = [[], []], set()
     for step in range(settings.length):
-        run.act(step)
+        run.act()
         if run.replay.size > settings.learning_starts:
             held = min(step + 1, 30)
             for s in range(2):
@@ -413,23 +413,24 @@ def test_the_recorded_loss_is_torchs_mean_since_the_last_moment(every):
                 chosen = values[torch.arange(32), rows[:, -1].long()]
                 losses[s].append(functional.smooth_l1_loss(chosen, y).item())
                 sides |= {bool(x) for x in (chosen - y).abs() > 1.0}
-            run.update(step)
-        run.copy_target()
+            run.update()
+        run.end_step()
         if (step + 1) % every == 0 and losses[0]:
-            found = run.moment(step + 1).loss
+            found = run.moment().loss
             for s in range(2):
                 assert found[s] == pytest.approx(np.mean(losses[s]), rel=1e-4)
             losses = [[], []]
     assert sides == {True, False}
-    assert np.isnan(run.moment(settings.length).loss).all()
+    assert np.isnan(run.moment().loss).all()
 
 
 def test_transitions_are_the_environments_and_discounts_its_gamma():
     settings = replace(TINY, random_steps=200, steps=1, learning_starts=1000)
     env = Corridor(horizon=7)
     run = Lockstep(settings, staged(settings, env), Start(), team(0, 1))
-    for step in range(200):
-        run.act(step)
+    for _ in range(200):
+        run.act()
+        run.end_step()
     for s in range(2):
         rows = run.replay.rows[s, :200].double().numpy()
         action = rows[:, -1].astype(int)

@@ -62,7 +62,7 @@ def test_plans_in_one_pool_write_what_they_write_alone(tmp_path):
 def test_the_longest_jobs_come_first_and_each_seed_once(tmp_path):
     out = ("progress=none", f"runs_dir={tmp_path}")
     both = plans(*FIGURES[:1], "scale=quick", "workers=2", *out, multirun=True)
-    work = runner.ordered([*runner.merged([*both, *both])])
+    work = runner.ordered([*runner.merged([*both, *both])], {})
     expected = [len(seeds) * costs.expected(plan) for plan, seeds in work]
     assert expected == sorted(expected, reverse=True)
     seeds = [(plan.directory, seed) for plan, group in work for seed in group]

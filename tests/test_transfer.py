@@ -138,7 +138,7 @@ FALL_ROW = (-2.0 - 0.5 * 0.05, 0.0, 0.45 + 3.0 * 0.05, 0.0)  # where FALLING lea
 def test_the_shaped_reward_of_a_step(shape, at):
     run = run_of(Start(potential=Known(), shape=shape))
     put(run, at)
-    run.act(0)
+    run.act()
     row = stored(run)
     absorbing = at == ARRIVING
     reward = 0.0 if absorbing else -1.0
@@ -159,7 +159,7 @@ def test_falling_costs_the_way_back_unless_shaping_looks_before_the_reset():
     for shape in (Shape(), RELEASED_SHAPE):
         run = run_of(Start(potential=Known(), shape=shape))
         put(run, FALLING)
-        run.act(0)
+        run.act()
         rewards.append(stored(run)["fixed"])
     assert rewards[0] < rewards[1] - 10.0
 
@@ -169,7 +169,7 @@ def test_falling_costs_the_way_back_unless_shaping_looks_before_the_reset():
 def test_what_a_boosted_step_stores(at, boost):
     run = run_of(Start(base=Known(best=3), boost=boost))
     put(run, at)
-    run.act(0)
+    run.act()
     row = stored(run)
     base = value(at) - abs(row["action"] - 3)
     absorbing = at == ARRIVING
@@ -189,12 +189,12 @@ def test_what_a_boosted_step_stores(at, boost):
 def test_shaping_and_boosting_together_store_both():
     run = run_of(Start(base=Known(3), potential=Known(), shape=Shape()))
     put(run, PATH)
-    run.act(0)
+    run.act()
     row = stored(run)
     shaped = -1.0 + 0.99 * value(row["after"]) - value(PATH)
     base = value(PATH) - abs(row["action"] - 3)
     assert row["fixed"] == pytest.approx(shaped - base, abs=1e-4)
-    learned = run.moment(0).learned
+    learned = run.moment().learned
     asked = np.array([[PATH]])
     raised = run.deep(asked, 8) + Known(3)(asked, 8) + value(PATH)
     assert np.allclose(learned.q(asked, 8), raised)
@@ -205,7 +205,8 @@ def test_the_horizons_end_is_bootstrapped_from_and_starts_anew():
     run = run_of(Start(), env=replace(TARGET, horizon=3))
     for step in range(4):
         before = run.state.copy()
-        run.act(step)
+        run.act()
+        run.end_step()
         assert stored(run, step)["discount"] == pytest.approx(0.99)
         assert np.allclose(stored(run, step)["state"], before[0], atol=1e-6)
     moved = stored(run, 2)["after"] - stored(run, 3)["state"]
@@ -290,7 +291,8 @@ def test_policy_reuse_in_a_run():
     settings = replace(SMALL, random_steps=20, epsilon=0.5)
     run = run_of(Start(prior=Known(4), steering=PolicyReuse(1.0)), settings)
     for step in range(40):
-        run.act(step)
+        run.act()
+        run.end_step()
         assert stored(run, step)["action"] == 4
 
 
@@ -304,7 +306,8 @@ def test_the_residual_policy_in_a_run():
     for step in range(80):
         before, u = run.state.copy(), draws[step]
         values = run.deep(before[:, None], 8)[0, 0]
-        run.act(step)
+        run.act()
+        run.end_step()
         if u[0] < (1.0 if step < 10 else 0.3):
             own = int(8 * u[1])
         else:
@@ -323,15 +326,16 @@ def test_the_residual_policy_in_a_run():
 @pytest.mark.parametrize("steering", [PolicyReuse(0.9), ResidualPolicy(30)])
 def test_evaluating_advances_no_counter(steering):
     run = run_of(Start(prior=Known(4), steering=steering), replace(SMALL, epsilon=0.3))
-    for step in range(20):
-        run.act(step)
+    for _ in range(20):
+        run.act()
+        run.end_step()
     seen = run.decisions.copy(), run.deep.steps, run.replay.added
     kept = run.state.copy()
-    first = evaluate(run.moment(20), (0,))
+    first = evaluate(run.moment(), (0,))
     assert (run.decisions == seen[0]).all()
     assert (run.deep.steps, run.replay.added) == seen[1:]
     assert np.array_equal(run.state, kept)
-    assert str(first) == str(evaluate(run.moment(20), (0,)))
+    assert str(first) == str(evaluate(run.moment(), (0,)))
 
 
 def test_evaluation_of_the_residual_policy_is_in_the_runs_phase():
@@ -340,7 +344,7 @@ def test_evaluation_of_the_residual_policy_is_in_the_runs_phase():
     lanes = 2 * SMALL.evaluation_episodes
     at = np.broadcast_to(np.array(PATH), (1, lanes, 4)).copy()
     u = np.random.default_rng(0).random((1, lanes, 3))
-    policy, half = run.moment(0).policy, SMALL.evaluation_episodes
+    policy, half = run.moment().policy, SMALL.evaluation_episodes
     alive = np.ones((1, lanes), bool)
     table, best = combined(TARGET.actions), run.deep(at, 8)[0, 0].argmax()
     drawn, random = (8 * u[0, :, 1]).astype(int), u[0, :, 0] < 0.1
@@ -357,7 +361,8 @@ def test_evaluation_of_policy_reuse_explores_with_the_prior_and_is_greedy_withou
     half = SMALL.evaluation_episodes
     at = np.broadcast_to(np.array(PATH), (1, 2 * half, 4)).copy()
     u = np.random.default_rng(0).random((1, 2 * half, 3))
-    found = run.moment(5).policy(at, u, np.ones((1, 2 * half), bool))[0]
+    run.step = 5
+    found = run.moment().policy(at, u, np.ones((1, 2 * half), bool))[0]
     best = run.deep(at, 8)[0, 0].argmax()
     free = np.where(u[0, :, 0] < 0.1, (8 * u[0, :, 1]).astype(int), best)
     expected = np.where(u[0, :, 2] < 0.9**5, 4, free)
@@ -423,10 +428,10 @@ def test_a_warm_start_goes_on_with_all_but_the_replay():
     assert (run.deep.steps, run.deep.optimiser.steps) == (90, 70)
     assert run.replay.size == 0 and not run.replay.rows.any()
     for step in range(25):  # step 100 copies the target, after 10 here
-        run.act(step)
+        run.act()
         if run.replay.size > 20:
-            run.update(step)
-        run.copy_target()
+            run.update()
+        run.end_step()
         assert torch.equal(run.deep.target.flat, old.online.flat) == (step >= 9)
     assert not torch.equal(run.deep.online.flat, old.online.flat)
     assert torch.equal(learned.residual.online.flat, old.online.flat)  # untouched
@@ -439,7 +444,7 @@ def test_a_boosted_stage_starts_with_new_networks_on_a_frozen_sum():
     run = run_of(begin([Boost()], first), settings)
     assert not torch.equal(run.deep.online.flat, first.residual.online.flat)
     assert (run.deep.steps, run.deep.optimiser.steps) == (0, 0)
-    q = run.moment(0).learned.q
+    q = run.moment().learned.q
     assert isinstance(q, Sum) and q.terms == (first.q, run.deep)
     x = np.array([[PATH]])
     assert np.allclose(q(x, 8), first.q(x, 8) + run.deep(x, 8))
@@ -488,7 +493,7 @@ def test_lspis_q_is_a_prior():
     start = begin([PolicyReuse(1.0)], learned)
     run = run_of(start)
     put(run, (-4.0, 0.0, 0.0, 0.0))
-    run.act(0)
+    run.act()
     done = int(stored(run)["action"])
     assert TARGET.actions[done].tolist() == [1.0, 0.0]
 
