@@ -53,14 +53,6 @@ class Config:
     progress: str = "auto"
 
 
-#: Keys that don't belong to a configuration's identity: they change no number, but for
-#: another device's rounding.
-OUTPUT_KEYS = (
-    *("seeds", "workers", "threads", "device"),
-    *("runs_dir", "tag", "progress"),
-)
-
-
 def register() -> None:
     """Make the schema known to Hydra as `schema`."""
     ConfigStore.instance().store(name="schema", node=Config)
