@@ -200,7 +200,7 @@ def _index_findings(folder: Path, tables: Mapping[int, pd.DataFrame]) -> list[Fi
     indices = {
         seed: table[list(INDEX[family_of(table)])] for seed, table in tables.items()
     }
-    keys = {seed: index.to_csv() for seed, index in indices.items()}
+    keys = {s: (*i.columns, i.to_numpy().tobytes()) for s, i in indices.items()}
     (usual, _), *others = Counter(keys.values()).most_common() or [(None, 0)]
     if not others:
         return []

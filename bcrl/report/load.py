@@ -58,7 +58,7 @@ def _refuse(
     refused = [f for f in findings if f.kind == BROKEN or not allow_incomplete]
     if not refused:
         return
-    lines = [f"nothing is drawn: {len(refused)} findings in {runs_dir / scale}"]
+    lines = [f"nothing is drawn, because in {runs_dir / scale}:"]
     lines += [f"  {finding}" for finding in refused[:LISTED]]
     if len(refused) > LISTED:
         more = len(refused) - LISTED

@@ -76,7 +76,9 @@ def _has_the_schema(document: dict[str, Any]) -> bool:
         asked(document)
         settled = isinstance(document["config"]["env"]["metrics"], list)
         state = status(document)
-        hashed = state != "complete" or {"csv", "npz"} <= document["sha256"].keys()
+        # A seed that failed may have done so before it had files.
+        needed = state == "complete" or (state == "failed" and "sha256" in document)
+        hashed = not needed or {"csv", "npz"} <= document["sha256"].keys()
     except (KeyError, TypeError, AttributeError):
         return False
     return settled and hashed and state in ("running", "complete", "failed")
@@ -135,8 +137,10 @@ def read_csv(path: Path, document: Mapping[str, Any]) -> pd.DataFrame:
     _check_index(path, table)
     known = METRICS.get(document["env"], ()) if family == "FQI" else DQN_METRICS
     for name in known:
-        bad = np.flatnonzero(~np.isfinite(table[name])) if name in table else ()
-        if len(bad) and name not in MAY_BE_NAN:
+        if name not in table or name in MAY_BE_NAN:
+            continue
+        bad = np.flatnonzero(~np.isfinite(table[name].to_numpy()))
+        if len(bad):
             raise unreadable(path, f"has a non-finite {name} in row {bad[0] + 1}")
     return table
 
@@ -148,12 +152,12 @@ def _check_index(path: Path, table: pd.DataFrame) -> None:
         if not np.array_equal(table["iteration"], expected):
             raise unreadable(path, f"does not count iterations 1 to {len(table)}")
     else:
-        steps = table["step"]
+        steps = table["step"].to_numpy()
         whole = np.isfinite(steps) & (steps >= 0) & (steps % 1 == 0)
         if not whole.all() or (np.diff(steps) < 0).any():
             raise unreadable(path, "has steps that are not whole numbers ≥ 0 or fall")
     for column in ("stage", "task"):
-        numbers = table[column]
+        numbers = table[column].to_numpy()
         if not (np.isfinite(numbers) & (numbers >= 1) & (numbers % 1 == 0)).all():
             raise unreadable(path, f"has a {column} that is not a whole number ≥ 1")
     if (np.diff(table["stage"]) < 0).any():
