@@ -6,7 +6,7 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -87,36 +87,21 @@ def check_folder(folder: Path) -> Checked:
     documents = _documents(folder, numbers, findings)
     findings += _config_findings(folder, documents)
     for seed, document in documents.items():
-        path = _path(folder, seed, "json")
-        if status(document) == "running":
-            what = 'says "running": it is being computed, or its process was killed'
-            findings.append(Finding(path, what, AGAIN, INCOMPLETE))
-            continue
-        if status(document) == "failed":
-            what = f'says "{document["status"]}"'
-            remedy = f"{AGAIN} to try it again, or leave it out"
-            findings.append(Finding(path, what, remedy, INCOMPLETE))
-            result.failed += (seed,)
+        csv, npz = (_path(folder, seed, suffix) for suffix in ("csv", "npz"))
+        state = status(document)
         try:
-            if "sha256" in document:  # absent if it failed before it had files
-                recorded(_path(folder, seed, "npz"), document)
-                recorded(_path(folder, seed, "csv"), document)
-            if status(document) == "complete":
-                table = read_csv(_path(folder, seed, "csv"), document)
+            if state != "running" and "sha256" in document:
+                recorded(npz, document)
+                recorded(csv, document)
+            if state == "complete":
+                table = read_csv(csv, document)
                 result.tables[seed], result.documents[seed] = table, document
         except Refused as error:
             findings.append(error.finding)
     findings += _index_findings(folder, result.tables)
+    findings += _incomplete_findings(folder, numbers, documents)
+    result.failed = tuple(s for s, d in documents.items() if status(d) == "failed")
     result.asked = frozenset().union(*map(asked, documents.values()))
-    missing = sorted(result.asked - numbers)
-    if missing:
-        noun = "seed" if len(missing) == 1 else "seeds"
-        what = f"lacks {noun} {ranges(missing)}, which had been asked for"
-        remedy = _command(documents.values(), missing[0])
-        findings.append(Finding(folder, what, remedy, INCOMPLETE))
-    if not numbers:
-        remedy = f"{AGAIN}, or move the folder away"
-        findings.append(Finding(folder, "has no seeds", remedy, INCOMPLETE))
     return result
 
 
@@ -223,6 +208,30 @@ def _columns(index: pd.DataFrame, model: pd.DataFrame) -> str:
         return f"length ({len(index)} rows, not {len(model)})"
     differ = [name for name in model if not model[name].equals(index.get(name))]
     return f"{listed(differ)} column{'s' * (len(differ) > 1)}"
+
+
+def _incomplete_findings(
+    folder: Path, numbers: set[int], documents: Documents
+) -> Iterator[Finding]:
+    """Seeds that are not complete: begun, failed, or not there though asked for."""
+    for seed, document in documents.items():
+        path = _path(folder, seed, "json")
+        if status(document) == "running":
+            what = 'says "running": it is being computed, or its process was killed'
+            yield Finding(path, what, AGAIN, INCOMPLETE)
+        if status(document) == "failed":
+            what = f'says "{document["status"]}"'
+            remedy = f"{AGAIN} to try it again, or leave it out"
+            yield Finding(path, what, remedy, INCOMPLETE)
+    missing = sorted(set().union(*map(asked, documents.values())) - numbers)
+    if missing:
+        noun = "seed" if len(missing) == 1 else "seeds"
+        what = f"lacks {noun} {ranges(missing)}, which had been asked for"
+        remedy = _command(documents.values(), missing[0])
+        yield Finding(folder, what, remedy, INCOMPLETE)
+    if not numbers:
+        remedy = f"{AGAIN}, or move the folder away"
+        yield Finding(folder, "has no seeds", remedy, INCOMPLETE)
 
 
 def _command(documents: Iterable[dict[str, Any]], seed: int) -> str:

@@ -51,6 +51,7 @@ def read_document(path: Path, belongs: Mapping[str, object]) -> dict[str, Any]:
     """
     try:
         document = json.loads(_bytes(path))
+        intact = isinstance(document, dict) and is_intact(document)
     except (ValueError, RecursionError) as error:
         raise unreadable(path, "is not readable JSON") from error
     if not isinstance(document, dict):
@@ -58,7 +59,7 @@ def read_document(path: Path, belongs: Mapping[str, object]) -> dict[str, Any]:
     if document.get("schema") != SCHEMA:
         what = f"has schema {document.get('schema')!r}, this version reads {SCHEMA}"
         raise unreadable(path, what)
-    if not is_intact(document):
+    if not intact:
         raise unreadable(path, "was changed after it was written (see its digest)")
     for key, value in belongs.items():
         if document.get(key) != value:
