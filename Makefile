@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup figures paper searches smoke test lint bench bench-peer clean
+.PHONY: help setup figures paper searches smoke verify test lint bench bench-peer clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -35,6 +35,9 @@ searches: $(READY) ## the searches of appendix C.3 on seeds of their own, with s
 smoke: $(READY) ## every variant in seconds, then the report
 	$(BIN)/bcrl -m experiment=fig1,fig2,fig4 scale=smoke workers=$(WORKERS)
 	$(BIN)/bcrl-report --scale smoke
+
+verify: $(READY) ## whether every result in runs/ is whole, unchanged and in its place
+	$(BIN)/bcrl-verify
 
 test: $(READY) ## the tests
 	$(BIN)/python -m pytest --numprocesses 2

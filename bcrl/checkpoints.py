@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from bcrl import pack
-from bcrl.compose import Plan, identity
+from bcrl.compose import Plan
 from bcrl.errors import BcrlError
 from bcrl.files import write_atomically
+from bcrl.identity import identity
 from bcrl.records import LIBRARIES, is_complete
 
 SCHEMA = 1  # raised when the content's meaning changes

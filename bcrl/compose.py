@@ -14,10 +14,11 @@ from typing import Any
 
 from bcrl import probes
 from bcrl.algorithms import algorithm
-from bcrl.composition import Composition, Plain, composition
-from bcrl.config import OUTPUT_KEYS, Choice, Config, construct, one_of
+from bcrl.composition import Composition, composition
+from bcrl.config import Choice, Config, construct, one_of
 from bcrl.envs import Env, env_class
 from bcrl.errors import ConfigError, at_least, did_you_mean
+from bcrl.identity import Plain, differences
 from bcrl.stage import Stage
 from bcrl.transfer import PolicyReuse, ResidualPolicy, Shape
 
@@ -63,32 +64,6 @@ class Plan:
     def length(self) -> int:
         """Iterations or environment steps of all stages."""
         return sum(stage.learner.length for stage in self.stages)
-
-
-def identity(config: Plain) -> Plain:
-    """The part of a config that decides numbers."""
-    kept = {k: v for k, v in config.items() if k not in OUTPUT_KEYS}
-    env = {k: v for k, v in kept["env"].items() if k != "paper_seeds"}
-    return kept | {"env": env}
-
-
-def differences(config: Plain, other: Plain) -> dict[str, tuple[Any, Any]]:
-    """Dotted keys at which two configs' identities differ, with both values."""
-    a, b = flat(identity(config)), flat(identity(other))
-    keys = sorted(a.keys() | b.keys())
-    both = {k: (a.get(k, "absent"), b.get(k, "absent")) for k in keys}
-    return {k: (x, y) for k, (x, y) in both.items() if x != y}
-
-
-def flat(config: Plain, prefix: str = "") -> Plain:
-    """Nested dicts as one, with dotted keys."""
-    out: Plain = {}
-    for key, value in config.items():
-        if isinstance(value, dict):
-            out |= flat(value, f"{prefix}{key}.")
-        else:
-            out[prefix + key] = value
-    return out
 
 
 def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:

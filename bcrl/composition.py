@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from bcrl.config import Choice, construct, one_of
 from bcrl.curriculum import CURRICULA
 from bcrl.envs import Env
 from bcrl.errors import ConfigError
+from bcrl.identity import Plain
 from bcrl.stage import Stage
 from bcrl.transfer import (
     TRANSFERS,
@@ -20,8 +20,6 @@ from bcrl.transfer import (
     Transfer,
     warm_start,
 )
-
-Plain = dict[str, Any]  # a resolved config: dicts, lists and scalars
 
 
 @dataclass(frozen=True)

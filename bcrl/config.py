@@ -54,14 +54,6 @@ class Config:
     checkpoint_every: float = 60.0
 
 
-#: Keys that don't belong to a configuration's identity: they change no number, but for
-#: another device's rounding.
-OUTPUT_KEYS = (
-    *("seeds", "workers", "threads", "device"),
-    *("runs_dir", "tag", "progress", "checkpoint_every"),
-)
-
-
 def register() -> None:
     """Make the schema known to Hydra as `schema`."""
     ConfigStore.instance().store(name="schema", node=Config)

@@ -17,9 +17,10 @@ import yaml
 from numpy.typing import NDArray
 
 from bcrl import __version__
-from bcrl.compose import Plain, Plan, differences, identity
+from bcrl.compose import Plan
 from bcrl.errors import BcrlError
 from bcrl.files import make_directory, sealed, sha256, write_atomically, write_text
+from bcrl.identity import Plain, differences, identity
 from bcrl.locks import waited_for
 
 SCHEMA = 2  # raised when a file's meaning changes

@@ -19,8 +19,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bcrl import compose
-from bcrl.compose import Plain, Plan
+from bcrl.compose import Plan
 from bcrl.errors import BcrlError, did_you_mean
+from bcrl.identity import Plain, differences, flat
 from bcrl.sweeps import experiments, first_lines, over_experiments, parse, product
 
 PACKAGE = Path(__file__).resolve().parent
@@ -170,7 +171,7 @@ def plan(
     for tag, released in ((None, False), (RELEASED, True)):
         variant = (f"env={choices['env']}", *_usual(config, choices, released))
         known[tag] = _plain(_compose(CONFIG_NAME, variant, extra))
-        if not compose.differences(config, known[tag]):
+        if not differences(config, known[tag]):
             break
     return compose.plan(config, known, choices["env"])
 
@@ -219,7 +220,7 @@ def _refuse_collisions(planned: Sequence[Plan]) -> None:
     seen: dict[Path, Plan] = {}
     for new in planned:
         old = seen.setdefault(new.directory, new)
-        changed = compose.differences(old.config, new.config)
+        changed = differences(old.config, new.config)
         if changed:
             key, (a, b) = next(iter(changed.items()))
             why = f"both {key}={a} and {key}={b} would write to {new.directory}"
@@ -270,6 +271,5 @@ def _known_keys(
             composed = hydra_compose(name, [*asked, *path])
         except (HydraException, OmegaConfBaseException):
             continue
-        flat = compose.flat(OmegaConf.to_container(composed))
-        return did_you_mean(key, flat)
+        return did_you_mean(key, flat(OmegaConf.to_container(composed)))
     return "see bcrl --help"

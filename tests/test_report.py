@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-import json
+import io
 import re
 from pathlib import Path
 
@@ -18,9 +18,12 @@ from bcrl import files
 from bcrl.report import cli, figures, style, verdicts
 from bcrl.report import statistics as st
 from bcrl.report.document import claims_report
-from bcrl.report.load import METHODS, METRICS, load_runs
+from bcrl.report.load import load_runs
 from bcrl.report.maze_figure import figure_3, seed_mean_value
+from bcrl.report.seedfiles import METRICS
 from bcrl.report.tables import aggregate
+from bcrl.report.variants import METHODS, Runs
+from tests.made_up import made_up_plan, rerecord, reseal, write_seeds
 
 LENGTHS = {
     "car_on_hill": (20, 20, 20),
@@ -94,27 +97,25 @@ def write_runs(
 ) -> None:
     """Complete runs as the runner leaves them."""
     stage = np.repeat(np.arange(1, len(lengths[env]) + 1), lengths[env])
+    facts = {"optimum": OPTIMUM if env == "maze" else None}
+    facts |= {"cpu_seconds": 3.6, "wall_seconds": 4.0}
     for method in methods:
-        folder = runs_dir / scale / env / (method + tag)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "config.yaml").write_text("env: made up\n")
-        for seed in range(seeds):
-            stem = folder / f"seed_{seed:04d}"
-            curriculum = method.startswith(("C-", "BC-"))
-            table = {
+        curriculum = method.startswith(("C-", "BC-"))
+
+        def table(seed: int, method=method, curriculum=curriculum) -> pd.DataFrame:
+            columns = {
                 "stage": stage,
                 "task": stage if curriculum else np.full(len(stage), stage[-1]),
                 "iteration": np.arange(1, len(stage) + 1),
                 **curves(env, method, seed, stage),
             }
-            pd.DataFrame(table).to_csv(f"{stem}.csv", index=False)
-            sidecar = {"schema": 1, "status": "complete", "seed": seed, "scale": scale}
-            sidecar |= {"env": env, "variant": method, "tag": tag[1:] or None}
-            sidecar |= {"optimum": OPTIMUM if env == "maze" else None}
-            sidecar |= {"cpu_seconds": 3.6, "wall_seconds": 4.0, "config": {}}
-            stem.with_suffix(".json").write_text(json.dumps(sidecar))
-            arrays = maze_arrays(method, seed) if env == "maze" else {}
-            np.savez(f"{stem}.npz", **arrays)
+            return pd.DataFrame(columns)
+
+        def arrays(seed: int, method=method) -> dict[str, np.ndarray]:
+            return maze_arrays(method, seed) if env == "maze" else {}
+
+        plan = made_up_plan(runs_dir, env, method + tag, range(seeds), scale)
+        write_seeds(plan, table, arrays, facts)
 
 
 @pytest.fixture
@@ -405,114 +406,129 @@ def test_claims_without_the_method_say_so(tmp_path):
 # --- diagnostics and malformed files
 
 
-def noted(runs_dir: Path) -> str:
-    return "\n".join(note.text for note in load_runs(runs_dir, "smoke").notes)
+def folder_of(runs_dir: Path, method: str) -> Path:
+    return runs_dir / "smoke" / "car_on_hill" / method
 
 
-def edit_csv(path: Path, edit) -> None:
-    edit(pd.read_csv(path)).to_csv(path, index=False)
+def footer_of(runs: Runs, *methods: str, compares: bool = True) -> str:
+    found = runs.methods("car_on_hill", None)
+    shown = {name: found[name] for name in methods or found}
+    return "\n".join(figures.small_print(runs, shown, "", 7.0, compares))
 
 
-def test_incomplete_seeds_are_named(runs_dir, capsys):
-    folder = runs_dir / "smoke" / "car_on_hill" / "B-FQI"
-    (folder / "seed_0002.json").unlink()
-    sidecar = json.loads((folder / "seed_0004.json").read_text())
-    sidecar["status"] = "running"
-    (folder / "seed_0004.json").write_text(json.dumps(sidecar))
-    (folder / "seed_0005.json").write_text('{"schema": 0, "status": "complete"}')
-    assert run(runs_dir, "--figures", "1") == 0
+def lose_seeds(runs_dir: Path) -> None:
+    """B-FQI's seeds 2 (never begun), 4 (not ended) and 5 (diverged)."""
+    folder = folder_of(runs_dir, "B-FQI")
+    for path in folder.glob("seed_0002.*"):
+        path.unlink()
+    reseal(folder / "seed_0004.json", status="running")
+    reseal(folder / "seed_0005.json", status="failed: non-finite weights")
+
+
+def test_incomplete_seeds_are_refused_by_name(runs_dir, capsys):
+    lose_seeds(runs_dir)
+    assert run(runs_dir, "--figures", "2") == 2  # the aggregate has all environments
     err = capsys.readouterr().err
-    assert "seed 2 is incomplete (no seed_0002.json)" in err
-    assert "seed 4 is incomplete (status running)" in err
-    assert "seed 5 is incomplete (schema 0, not 1)" in err
+    assert "B-FQI lacks seed 2, which had been asked for: run the same command" in err
+    assert 'seed_0004.json says "running"' in err
+    assert 'seed_0005.json says "failed: non-finite weights"' in err
+    assert "--allow-incomplete draws what is complete" in err
+    assert not (runs_dir / "figures").exists()
+
+
+def test_incomplete_seeds_are_left_out_on_request(runs_dir, capsys):
+    lose_seeds(runs_dir)
+    assert run(runs_dir, "--figures", "1", "--allow-incomplete") == 0
+    err = capsys.readouterr().err
+    assert "B-FQI: INCOMPLETE, 3 of 6 seeds drawn: " in err
+    assert 'seed_0004.json says "running"' in err
+    assert "lacks seed 2" in err
     assert "0–5: FQI, C-FQI and BC-FQI; 0–1, 3: B-FQI" in err
-    runs = load_runs(runs_dir, "smoke")
-    footer = "\n".join(
-        figures.small_print(runs, runs.methods("car_on_hill", None), "", 7.0)
+    runs = load_runs(runs_dir, "smoke", allow_incomplete=True)
+    said = "INCOMPLETE: B-FQI 3 of 6 seeds (1 failed)"
+    assert said in footer_of(runs).splitlines()
+    with style.sheet():
+        assert said in figures.figure_1(runs).get_supxlabel()
+    document = (runs_dir / "figures" / "claims_smoke.md").read_text()
+    assert f"**{said}**" in document.splitlines()[:4]
+    assert "lacks seed 2" in document.split("## Notes")[1]
+    alone = footer_of(runs, "FQI", compares=False)
+    assert "INCOMPLETE" not in alone and "Note" not in alone
+
+
+def test_a_method_without_a_complete_seed_is_said_to_be_so(runs_dir):
+    for path in folder_of(runs_dir, "C-FQI").glob("seed_*.json"):
+        reseal(path, status="running")
+    runs = load_runs(runs_dir, "smoke", allow_incomplete=True)
+    assert "C-FQI" not in runs.methods("car_on_hill", None)
+    assert "INCOMPLETE: C-FQI 0 of 6 seeds" in footer_of(runs)
+    assert "no runs of C-FQI" in footer_of(runs)
+    assert "INCOMPLETE" not in footer_of(runs, "BC-FQI", compares=False)
+    assert "INCOMPLETE: C-FQI 0 of 6 seeds" in claims_report(runs)
+
+
+def test_what_is_complete_says_nothing(runs_dir):
+    runs = load_runs(runs_dir, "smoke", allow_incomplete=True)
+    assert runs.notes == []
+    assert "INCOMPLETE" not in footer_of(runs) + claims_report(runs)
+
+
+def test_broken_files_are_refused_even_so(runs_dir, capsys):
+    folder = folder_of(runs_dir, "FQI")
+    for seed in range(6):
+        (folder / f"seed_{seed:04d}.csv").write_text("")
+        (folder / f"seed_{seed:04d} (copy).npz").write_text("")
+    for more in ([], ["--allow-incomplete"]):
+        assert run(runs_dir, "--figures", "1", *more) == 2
+        err = capsys.readouterr().err
+        assert f"{folder}/seed_0003.csv is not what seed_0003.json has the SHA" in err
+        assert f"delete {folder}/seed_0003.* and run the same command again" in err
+        assert f"and 2 more; `bcrl-verify {runs_dir}` lists all" in err
+        assert "Traceback" not in err
+        assert ("broken files are refused" in err) == bool(more)
+    assert not (runs_dir / "figures").exists()
+
+
+def test_runs_of_another_scale_do_not_matter(runs_dir):
+    write_runs(runs_dir, "car_on_hill", scale="quick", seeds=1)
+    (runs_dir / "quick" / "car_on_hill" / "FQI" / "config.yaml").unlink()
+    assert run(runs_dir, "--figures", "1") == 0
+
+
+def test_unequal_methods_and_absent_ones_are_named(tmp_path):
+    write_runs(tmp_path, "car_on_hill", methods=METHODS[:2])
+    write_runs(
+        tmp_path, "car_on_hill", methods=("B-FQI",), lengths={"car_on_hill": (7,)}
     )
-    assert "B-FQI 3" in footer
-    assert "seed 2 incomplete" in footer.replace("\n", " ")
-    only = {"FQI": runs.methods("car_on_hill", None)["FQI"]}
-    alone = figures.small_print(runs, only, "", 7.0, compares=False)
-    assert "Note" not in "".join(alone)
-
-
-def test_unequal_iterations_are_named(runs_dir):
-    folder = runs_dir / "smoke" / "car_on_hill" / "FQI"
-    edit_csv(folder / "seed_0001.csv", lambda table: table[:7])
-    err = noted(runs_dir)
-    assert "7: seed 1" in err
-    assert "(7: FQI; 9: C-FQI, B-FQI and BC-FQI)" in err
-    assert load_runs(runs_dir, "smoke").methods("car_on_hill", None)["FQI"].metrics[
-        "return"
-    ].shape == (6, 7)
-
-
-def test_missing_variant_and_odd_values_are_named(tmp_path):
-    write_runs(tmp_path, "car_on_hill", methods=METHODS[:3])
-    path = tmp_path / "smoke" / "car_on_hill" / "FQI" / "seed_0005.csv"
-    edit_csv(path, lambda table: table.assign(q_error=np.inf))
-    err = noted(tmp_path)
-    assert "no runs of BC-FQI" in err
-    assert "q_error has non-finite values in seed 5" in err
-    found = verdicts_of(claims_report(load_runs(tmp_path, "smoke")), "Car")
-    jumps = "C-FQI's error jumps from T1 to T2"
-    assert found[jumps] in ("holds", "does not hold", "undecided")
+    runs = load_runs(tmp_path, "smoke")
+    noted = "\n".join(note.text for note in runs.notes)
+    assert "iterations differ between methods (9: FQI and C-FQI; 7: B-FQI)" in noted
+    assert "no runs of BC-FQI" in noted
+    found = verdicts_of(claims_report(runs), "Car")
     assert found["BC-FQI ends with a smaller error than FQI"] == "no runs of BC-FQI"
-    table = aggregate(load_runs(tmp_path, "smoke"))
-    rows = table.query("variant == 'FQI' and metric == 'q_error'")
-    assert rows["mean"].isna().all()
 
 
-def test_unexpected_headers_are_named(runs_dir):
-    folder = runs_dir / "smoke" / "car_on_hill" / "FQI"
-    edit_csv(folder / "seed_0000.csv", lambda table: table.assign(extra=1))
-    edit_csv(folder / "seed_0001.csv", lambda table: table.drop(columns="return"))
-    err = noted(runs_dir)
-    assert "seed_0000.csv: header is stage,task,iteration,q_error,return,extra" in err
-    assert "no return: left out" in err
-    variant = load_runs(runs_dir, "smoke").methods("car_on_hill", None)["FQI"]
-    assert variant.seeds == (0, 2, 3, 4, 5)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("seed_0003.csv", "", "is not a readable CSV"),
-        ("seed_0003.csv", "stage,task,iteration,return\n1,1,one,2\n", "not a number"),
-        ("seed_0003.csv", "stage,task,iteration\n1,1,2\n", "does not count"),
-        ("seed_0003.csv", "stage,task,iteration\n", "has no rows"),
-        ("seed_0003.json", '{"status": "compl', "is not readable JSON"),
-        ("seed_0003.json", '{"schema": 1, "seed": 4}', "belongs to seed 4"),
-        ("seed_0003.npz", "PK", "is not a readable NPZ"),
-        ("seed_0003.npz", None, "is missing"),
-        ("seed_0003.csv", None, "is missing"),
-    ],
-)
-def test_malformed_files_are_refused(runs_dir, capsys, name, content, message):
-    path = runs_dir / "smoke" / "maze" / "FQI" / name
-    path.unlink() if content is None else path.write_text(content)
-    assert run(runs_dir, "--figures", "3") == 2
-    err = capsys.readouterr().err
-    assert f"{path} {message}" in err or (str(path) in err and message in err)
-    assert "delete" in err
-    assert "rerun" in err
-    assert "Traceback" not in err
-
-
-def test_mixed_configurations_are_refused(runs_dir, capsys):
-    path = runs_dir / "smoke" / "maze" / "FQI" / "seed_0002.csv"
-    edit_csv(path, lambda table: table.assign(stage=1))
-    assert run(runs_dir) == 2
-    assert "mixes two configurations" in capsys.readouterr().err
+def test_variants_that_record_too_little_are_left_out_by_name(tmp_path):
+    write_runs(tmp_path, "car_on_hill", methods=("FQI",))
+    env = {"name": "car_on_hill", "metrics": ["return"]}
+    plan = made_up_plan(
+        tmp_path, "car_on_hill", "C-FQI@own", range(2), config={"env": env}
+    )
+    row = {"stage": 1, "task": 1, "iteration": 1, "return": 0.5}
+    write_seeds(plan, lambda seed: pd.DataFrame([row]))
+    runs = load_runs(tmp_path, "smoke")
+    assert [v.name for v in runs.variants] == ["FQI"]
+    assert "C-FQI@own: does not record q_error: left out" in runs.notes[0].text
 
 
 def test_pickled_arrays_are_refused(runs_dir, capsys):
     path = runs_dir / "smoke" / "maze" / "FQI" / "seed_0002.npz"
-    arrays = maze_arrays("FQI", 2) | {"q": np.array([{}], dtype=object)}
-    np.savez(path, **arrays)
+    stored = io.BytesIO()
+    np.savez(stored, q=np.array([{}], dtype=object), states=LATTICE)
+    rerecord(path, stored.getvalue())
     assert run(runs_dir, "--figures", "3") == 2
-    assert "is not a readable NPZ" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert f"{path} is not a readable NPZ: delete" in err
 
 
 def test_no_runs_at_all(tmp_path, capsys):
@@ -541,14 +557,14 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
 def test_out_that_is_a_file(runs_dir, tmp_path, capsys):
     (tmp_path / "out").write_text("")
     assert run(runs_dir, "--out", str(tmp_path / "out"), "--figures", "1") == 2
-    assert "cannot write" in capsys.readouterr().err
+    assert "--out: can't make" in capsys.readouterr().err
 
 
 def test_report_imports_no_training_code():
     for path in Path(bcrl.report.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and node.module.startswith("bcrl"):
-                ours = ("bcrl.report", "bcrl.errors", "bcrl.files")
+                ours = ("bcrl.report", "bcrl.errors", "bcrl.identity", "bcrl.files")
                 allowed = node.module.startswith(ours)
                 assert allowed or [n.name for n in node.names] == ["__version__"]
 

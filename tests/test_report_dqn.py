@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from pathlib import Path
@@ -10,12 +11,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from bcrl.errors import BcrlError
 from bcrl.report import cli, curves, style
 from bcrl.report.document import claims_report
 from bcrl.report.linear_figures import figure_4a, figure_4b, prior
-from bcrl.report.load import COMPARED, DQN_METRICS, load_runs
+from bcrl.report.load import COMPARED, load_runs
 from bcrl.report.notes import tags_shown
+from bcrl.report.seedfiles import DQN_METRICS, METRICS
 from bcrl.report.sweeps import groups, sweep_report, sweep_table
+from tests.made_up import edit_csv, made_up_plan, rerecord, reseal, write_seeds
 
 SEVEN = COMPARED["linear_system", "DQN"]
 LEVEL = {"DQN": -100, "C-DQN": -120, "BC-DQN": -80, "SC-DQN": -60, "SBC-DQN": -45}
@@ -93,22 +97,18 @@ def write(
 ) -> None:
     """Complete runs as the runner leaves them."""
     for method in methods:
-        folder = runs_dir / "smoke" / env / (method + tag)
-        folder.mkdir(parents=True, exist_ok=True)
         stages = steps_of(method)
         first = "dqn" if method in ("DQN", "C-DQN", "S-DQN") else "lspi"
-        for seed in seeds:
-            stem = folder / f"seed_{seed:04d}"
-            table = made_up(method, seed, scatter)
-            table.loc[table["task"] == 2, "return"] += shift
-            table.to_csv(f"{stem}.csv", index=False, na_rep="nan")
-            sidecar = {"schema": 1, "status": "complete", "seed": seed}
-            sidecar |= {"scale": "smoke", "env": env, "variant": method}
-            sidecar |= {"tag": tag[1:] or None, "optimum": None, "cpu_seconds": 60.0}
-            sidecar |= {"learners": [first, "dqn"][: len(stages)]}
-            sidecar |= {"config": config or {}}
-            stem.with_suffix(".json").write_text(json.dumps(sidecar))
-            np.savez(f"{stem}.npz", **arrays(method))
+        facts = {"learners": [first, "dqn"][: len(stages)]}
+        facts |= {"optimum": None, "cpu_seconds": 60.0}
+
+        def table(seed: int, method=method) -> pd.DataFrame:
+            found = made_up(method, seed, scatter)
+            found.loc[found["task"] == 2, "return"] += shift
+            return found
+
+        plan = made_up_plan(runs_dir, env, method + tag, seeds, config=config)
+        write_seeds(plan, table, lambda seed, method=method: arrays(method), facts)
 
 
 def run(runs_dir: Path, *arguments: str) -> int:
@@ -117,14 +117,6 @@ def run(runs_dir: Path, *arguments: str) -> int:
 
 def csv(runs_dir: Path, folder: str, seed: int) -> Path:
     return runs_dir / "smoke" / "linear_system" / folder / f"seed_{seed:04d}.csv"
-
-
-def edit_csv(path: Path, edit) -> None:
-    edit(pd.read_csv(path)).to_csv(path, index=False, na_rep="nan")
-
-
-def noted(runs_dir: Path) -> str:
-    return "\n".join(note.text for note in load_runs(runs_dir, "smoke").notes)
 
 
 def verdicts_of(document: str) -> dict[str, str]:
@@ -151,13 +143,9 @@ def test_runs_are_read_without_a_note(tmp_path):
 
 def test_families_stand_side_by_side(tmp_path):
     write(tmp_path, ("DQN",), env="maze")
-    folder = tmp_path / "smoke" / "maze" / "FQI"
-    folder.mkdir()
-    text = "stage,task,iteration,return,q_error_start,q_error,residual_start,solved\n"
-    (folder / "seed_0000.csv").write_text(text + "1,1,1,-5,1,1,1,0\n")
-    (folder / "seed_0000.json").write_text(
-        '{"schema": 1, "status": "complete", "seed": 0}'
-    )
+    row = dict.fromkeys(("stage", "task", "iteration", *METRICS["maze"]), 1)
+    plan = made_up_plan(tmp_path, "maze", "FQI", range(1))
+    write_seeds(plan, lambda seed: pd.DataFrame([row]))
     runs = load_runs(tmp_path, "smoke")
     assert list(runs.methods("maze", None)) == ["FQI"]
     assert list(runs.methods("maze", None, "DQN")) == ["DQN"]
@@ -174,55 +162,58 @@ def test_families_stand_side_by_side(tmp_path):
 
 def test_failed_seeds_are_left_out_by_name(tmp_path):
     write(tmp_path, ("DQN", "C-DQN"))
-    path = csv(tmp_path, "DQN", 2).with_suffix(".json")
     failed = "failed: non-finite weights at step 12000"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"status": failed}))
-    assert "seed 2 failed (non-finite weights at step 12000): left out" in noted(
-        tmp_path
-    )
-    runs = load_runs(tmp_path, "smoke")
+    reseal(csv(tmp_path, "DQN", 2).with_suffix(".json"), status=failed)
+    with pytest.raises(BcrlError, match=f'seed_0002.json says "{failed}"'):
+        load_runs(tmp_path, "smoke")
+    runs = load_runs(tmp_path, "smoke", allow_incomplete=True)
+    assert f'seed_0002.json says "{failed}"' in runs.notes[0].text
     variant = runs.methods("linear_system", None, "DQN")["DQN"]
     assert variant.seeds == (0, 1, 3, 4, 5)
     assert variant.failed == (2,)
     assert "| DQN | 5 (1 failed) |" in claims_report(runs)
+    with style.sheet():
+        footer = figure_4a(runs).get_supxlabel()
+    assert "INCOMPLETE: DQN 5 of 6 seeds (1 failed)" in footer
 
 
-def test_non_finite_returns_are_named(tmp_path):
+def test_methods_outside_the_figure_are_not_its_concern(tmp_path):
+    write(tmp_path, ("DQN", "C-DQN", "S-DQN"), range(2))
+    reseal(csv(tmp_path, "S-DQN", 1).with_suffix(".json"), status="running")
+    runs = load_runs(tmp_path, "smoke", allow_incomplete=True)
+    with style.sheet():
+        assert "INCOMPLETE" not in figure_4a(runs).get_supxlabel()
+    assert "INCOMPLETE: S-DQN 1 of 2 seeds" in claims_report(runs)
+
+
+def test_nothing_to_average_is_no_fault(tmp_path):
     write(tmp_path, ("DQN",))
     edit_csv(csv(tmp_path, "DQN", 1), lambda t: t.assign(q_mean=np.nan))
-    assert "non-finite" not in noted(tmp_path)
-    edit_csv(csv(tmp_path, "DQN", 1), lambda t: t.assign(greedy_return=np.inf))
-    assert "greedy_return has non-finite values in seed 1" in noted(tmp_path)
-
-
-def test_unequal_lengths_are_cut(tmp_path):
-    write(tmp_path, ("DQN",))
-    edit_csv(csv(tmp_path, "DQN", 1), lambda t: t[:30])
-    assert "evaluations differ between seeds" in noted(tmp_path)
-    variant = load_runs(tmp_path, "smoke").variants[0]
-    assert variant.metrics["return"].shape == (6, 30)
+    assert load_runs(tmp_path, "smoke").variants[0].seeds == tuple(range(6))
 
 
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda t: t.assign(step=t["step"] * 2), "another step column"),
+        (lambda t: t.assign(step=t["step"] * 2), "in its step column"),
+        (lambda t: t[:30], "in its length (30 rows, not 41)"),
+        (lambda t: t.assign(greedy_return=np.inf), "a non-finite greedy_return in row"),
         (lambda t: t.assign(step=t["step"][::-1].to_numpy()), "or fall"),
         (lambda t: t.assign(step=t["step"] + 0.5), "not whole numbers"),
         (lambda t: t.assign(step=t["step"] - 1000), "not whole numbers"),
         (
             lambda t: t.assign(step=range(1, 42)).rename(columns={"step": "iteration"}),
-            "another step column",
+            "has the header stage,task,iteration",
         ),
     ],
 )
-def test_bad_steps_are_refused(tmp_path, capsys, edit, message):
+def test_bad_tables_are_refused(tmp_path, capsys, edit, message):
     write(tmp_path, ("DQN",))
     edit_csv(csv(tmp_path, "DQN", 3), edit)
     assert run(tmp_path) == 2
     err = capsys.readouterr().err
     assert message in err
-    assert "rerun" in err
+    assert "seed_0003.* and run the same command again" in err
 
 
 def test_absent_methods_are_named(tmp_path, capsys):
@@ -308,7 +299,9 @@ def test_bad_arrays_are_refused(tmp_path, capsys, change, message):
     write(tmp_path, ("C-DQN",), range(1))
     stored = arrays("C-DQN") | change
     path = csv(tmp_path, "C-DQN", 0).with_suffix(".npz")
-    np.savez(path, **{k: v for k, v in stored.items() if v is not None})
+    changed = io.BytesIO()
+    np.savez(changed, **{k: v for k, v in stored.items() if v is not None})
+    rerecord(path, changed.getvalue())
     assert run(tmp_path, "--figures", "4b") == 2
     assert message in capsys.readouterr().err
 
@@ -390,7 +383,7 @@ def search(tmp_path: Path) -> None:
     for update, shift in ((200, 0.0), (2000, 9.0), ([25, 4000], -9.0)):
         tag = "" if update == 200 else f"@f{str(update)[-5:-1]}"
         config = {"algorithm": {"target_update": update, "batch": 32}, "tag": tag}
-        config |= {"seeds": {"first": shift}, "workers": shift, "device": str(shift)}
+        config |= {"workers": shift, "device": str(shift)}
         seeds = range(1000, 1005)
         write(tmp_path, ("BC-DQN",), seeds, tag, config=config, shift=shift, scatter=1)
 
@@ -422,25 +415,23 @@ def test_sweeps(tmp_path, capsys):
 
 
 def test_sweep_over_fqi_and_failed_seeds(tmp_path):
-    for tag, value in (("", -5.0), ("@trees100", -3.0)):
-        folder = tmp_path / "smoke" / "linear_system" / f"FQI{tag}"
-        folder.mkdir(parents=True)
-        for seed in range(2):
-            stem = folder / f"seed_{seed:04d}"
-            text = f"stage,task,iteration,return\n1,1,1,-9\n1,1,2,{value}\n"
-            stem.with_suffix(".csv").write_text(text)
-            config = {"algorithm": {"regressor": {"trees": 100 if tag else 50}}}
-            sidecar = {"schema": 1, "status": "complete", "config": config}
-            stem.with_suffix(".json").write_text(json.dumps(sidecar))
+    for tag, trees, value in (("", 50, -5.0), ("@trees100", 100, -3.0)):
+        config = {"algorithm": {"regressor": {"trees": trees}}}
+        seeds = range(3 if tag else 2)
+        plan = made_up_plan(
+            tmp_path, "linear_system", f"FQI{tag}", seeds, "smoke", config
+        )
+        rows = {"stage": 1, "task": 1, "iteration": [1, 2], "return": [-9.0, value]}
+        write_seeds(plan, lambda seed, rows=rows: pd.DataFrame(rows))
     path = tmp_path / "smoke/linear_system/FQI@trees100/seed_0002.json"
-    path.write_text('{"schema": 1, "status": "failed: non-finite weights at step 3"}')
-    runs = load_runs(tmp_path, "smoke")
+    reseal(path, status="failed: non-finite weights at step 3")
+    runs = load_runs(tmp_path, "smoke", allow_incomplete=True)
     (group,) = groups(runs)
     text = sweep_report(runs, [group])
     returns = "– | **−3.000 [−3.000, −3.000]** | – |"
     row = f"| FQI@trees100 | 100 | 0–1 · 2 (1 failed) | {returns}"
     assert row in text
-    assert "seed 2 failed (non-finite weights at step 3): left out" in text
+    assert 'seed_0002.json says "failed: non-finite weights at step 3"' in text
     assert sweep_table([group])["last_return"].tolist() == [-5.0, -3.0]
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from bcrl.composition import Composition, Plain, capped, placed
+from bcrl.composition import Composition, capped, placed
 from bcrl.config import construct, one_of, per_task
 from bcrl.envs import Env
 from bcrl.errors import ConfigError, at_least
+from bcrl.identity import Plain
 from bcrl.learners.dqn import DQN
 from bcrl.learners.lspi import LSPI
 from bcrl.q.quadratic import FEATURES

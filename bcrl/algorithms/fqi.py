@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from bcrl.composition import Composition, Plain, capped, placed
+from bcrl.composition import Composition, capped, placed
 from bcrl.config import construct, one_of, per_task
 from bcrl.envs import Env, is_finite
 from bcrl.errors import ConfigError
+from bcrl.identity import Plain
 from bcrl.learners.fqi import FQI
 from bcrl.q.regressors import Regressor, regressor_class
 from bcrl.stage import Stage

@@ -127,15 +127,8 @@ def _before_target(variant: Variant, metric: str) -> NDArray[np.float64]:
     return variant.metrics[metric][:, rows].mean(axis=1)
 
 
-def _known(values: NDArray[np.float64], metric: str) -> NDArray[np.float64]:
-    """`values`, unless one is non-finite, which no comparison would notice."""
-    if not np.isfinite(values).all():
-        raise NotMeasurable(f"{metric} has non-finite values")
-    return values
-
-
 def _solved(variant: Variant) -> NDArray[np.bool_]:
-    return _known(final(variant, "solved"), "solved") > 0
+    return final(variant, "solved") > 0
 
 
 def _never(variant: Variant) -> Measured:
@@ -150,8 +143,7 @@ def _optimum(variant: Variant) -> float:
 
 
 def _at_optimum(variant: Variant) -> Measured:
-    returns = _known(final(variant, "return"), "return")
-    return share(returns >= _optimum(variant) - OPTIMAL)
+    return share(final(variant, "return") >= _optimum(variant) - OPTIMAL)
 
 
 def _above_near(variant: Variant) -> Measured:

@@ -61,6 +61,11 @@ def parser() -> argparse.ArgumentParser:
         "--tag",
         help="use the variants X@TAG instead of the plain ones",
     )
+    result.add_argument(
+        "--allow-incomplete",
+        action="store_true",
+        help="draw what is complete of unfinished runs, and say so in every figure",
+    )
     result.add_argument("--out", type=Path, help="default: figures in the runs' folder")
     result.add_argument("--version", action="version", version=__version__)
     return result
@@ -111,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     chosen = FIGURES if "all" in options.figures else dict.fromkeys(options.figures)
     try:
-        runs = load_runs(options.runs_dir, options.scale)
+        runs = load_runs(options.runs_dir, options.scale, options.allow_incomplete)
         for note in runs.notes:
             print(f"note: {note.text}", file=sys.stderr)
         out = options.out or options.runs_dir / "figures"

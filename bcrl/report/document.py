@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from bcrl.report.claims import car_claims, maze_claims
 from bcrl.report.curves import linear_methods
 from bcrl.report.linear_claims import LATE, late_table, linear_claims
-from bcrl.report.notes import Note, tags_shown
+from bcrl.report.notes import Note, incomplete, tags_shown
 from bcrl.report.tables import final_table, markdown, stage_table
 from bcrl.report.variants import Runs, Variant
 from bcrl.report.verdicts import FEWEST_SEEDS
@@ -39,7 +39,12 @@ by itself, without a correction for their number.
 def claims_report(runs: Runs, tag: str | None = None) -> str:
     """The Markdown document: per environment the claims and the values behind them."""
     tagged = f", variants @{tag}" if tag else ""
-    parts = [f"# The paper's claims, scale {runs.scale}{tagged}\n", PREAMBLE]
+    linear = linear_methods(runs, tag)
+    notes = [n for n in runs.notes if n.tag == tag or _stands_in(n, linear)]
+    parts = [f"# The paper's claims, scale {runs.scale}{tagged}\n"]
+    if lacking := incomplete(notes):
+        parts.append(f"**{lacking}**\n")
+    parts.append(PREAMBLE)
     for env, title, claims in SECTIONS:
         methods = runs.methods(env, tag)
         parts.append(f"## {title}\n")
@@ -53,12 +58,10 @@ def claims_report(runs: Runs, tag: str | None = None) -> str:
         parts.append(final_table(methods))
         parts.extend(_by_stage(methods))
         parts.append(_cost(methods))
-    linear = linear_methods(runs, tag)
     parts.extend(_linear_section(linear))
-    notes = [f"- {n.text}" for n in runs.notes if n.tag == tag or _stands_in(n, linear)]
     if notes:
         parts.append("## Notes on the runs\n")
-        parts.append("\n".join(notes) + "\n")
+        parts.append("\n".join(f"- {note.text}" for note in notes) + "\n")
     return "\n".join(parts)
 
 

@@ -44,9 +44,7 @@ def small_print(
     tags = tags_shown(methods)
     tagged = f" · {tags}" if tags else ""
     lines = [f"{ENV_TITLES[env]} · scale {runs.scale} · {seeds}{tagged} · {what}"]
-    odd = remarks(runs.notes, methods, compares)
-    if odd:
-        lines.append("Note: " + "; ".join(odd))
+    lines += remarks(runs.notes, methods, compares)
     limit = int(width * FOOTER_WIDTH)
     return [part for line in lines for part in textwrap.wrap(line, limit)]
 

@@ -21,7 +21,7 @@ from bcrl.report.curves import (
     target_rows,
 )
 from bcrl.report.figures import small_print
-from bcrl.report.seedfiles import unreadable
+from bcrl.report.findings import unreadable
 from bcrl.report.statistics import mean, standard_error
 from bcrl.report.variants import Runs, Variant
 

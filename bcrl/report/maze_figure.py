@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bcrl.report import style
 from bcrl.report.figures import small_print
-from bcrl.report.seedfiles import unreadable
+from bcrl.report.findings import unreadable
 from bcrl.report.variants import METHODS, Runs, Variant
 
 SIZE = (11.4, 4.2)  # inches
@@ -119,7 +119,7 @@ def _paths(
                 zorder=3,
             )
         draw_ends(axes, goal, paths[0][0])
-        solved = int(np.nansum(variant.metrics["solved"][:, -1]))
+        solved = int(variant.metrics["solved"][:, -1].sum())
         frame(axes, f"{name}: {solved} of {len(paths)} arrive")
 
 

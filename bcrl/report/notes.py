@@ -15,7 +15,8 @@ class Note:
     """One diagnostic: `text` for the terminal, `footer` (if any) for the figures.
 
     It concerns the figures of `env` that draw the variants tagged `tag`: those with
-    `method` in them, or those that compare methods of `family` if it is None.
+    `method` in them, and those that compare the methods of `family`, if one is named.
+    `incomplete`: it counts the seeds of a variant that lacks some.
     """
 
     text: str
@@ -24,6 +25,7 @@ class Note:
     footer: str = ""
     method: str | None = None
     family: str | None = None
+    incomplete: bool = False
 
 
 def listed(items: Iterable[object]) -> str:
@@ -68,7 +70,7 @@ def tags_shown(methods: Mapping[str, Variant]) -> str:
 def remarks(
     notes: Iterable[Note], methods: Mapping[str, Variant], compares: bool = True
 ) -> list[str]:
-    """What belongs under a figure of `methods`, which may be of several tags.
+    """The lines that belong under a figure of `methods`, which may be of several tags.
 
     `compares`: differences between methods belong to it too.
     """
@@ -78,14 +80,26 @@ def remarks(
     def belongs(note: Note) -> bool:
         if note.env != env:
             return False
-        if note.method is None:
-            return compares and note.family == family and {note.tag} == tags
-        return note.method in methods and methods[note.method].tag == note.tag
+        if note.method in methods and methods[note.method].tag == note.tag:
+            return True
+        # Of a method that is not drawn: perhaps it has no complete seed.
+        awaited = {note.tag} <= tags if note.method else {note.tag} == tags
+        return compares and note.family == family and awaited
 
     shown = [note for note in notes if belongs(note)]
     if compares and len(tags) > 1:  # no notes were made for such a mixture yet
         shown += across_methods(methods, methods, env, None, family)
-    return [note.footer for note in shown if note.footer]
+    lines = [incomplete(shown)]
+    odd = [note.footer for note in shown if note.footer and not note.incomplete]
+    if odd:
+        lines.append("Note: " + "; ".join(odd))
+    return [line for line in lines if line]
+
+
+def incomplete(notes: Iterable[Note]) -> str:
+    """`INCOMPLETE: BC-FQI 3 of 20 seeds`; empty if nothing is."""
+    counts = [note.footer for note in notes if note.incomplete]
+    return f"INCOMPLETE: {', '.join(counts)}" if counts else ""
 
 
 def across_methods(

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from bcrl.identity import OUTPUT_KEYS
 from bcrl.report.curves import WINDOW, last, late
 from bcrl.report.linear_claims import seeds_cell
 from bcrl.report.notes import ranges
@@ -18,10 +19,7 @@ from bcrl.report.statistics import bootstrap
 from bcrl.report.tables import estimate, markdown
 from bcrl.report.variants import Runs, Variant
 
-#: Top-level keys of a config that say on what, where or how fast it was run.
-IGNORED = frozenset(
-    ("seeds", "workers", "threads", "runs_dir", "tag", "progress", "device", "scale")
-)
+IGNORED = (*OUTPUT_KEYS, "scale")  # top-level keys of a config that all may differ in
 ABSENT = "–"  # a variant's config lacks the key
 
 PREAMBLE = f"""\
@@ -166,19 +164,11 @@ def sweep_report(runs: Runs, found: list[Group]) -> str:
         parts.append(f"{len(group.variants)} variants. {same}\n")
         parts.append(_group_table(group))
     ours = {(group.env, group.method) for group in found}
-    odd = [n.text for n in runs.notes if _names(n.text, n.env, ours)]
+    odd = [n.text for n in runs.notes if (n.env, n.method) in ours]
     if odd:
         parts.append("## Notes on these runs\n")
         parts.append("\n".join(f"- {text}" for text in odd) + "\n")
     return "\n".join(parts)
-
-
-def _names(text: str, env: str, ours: set[tuple[str, str]]) -> bool:
-    """Whether a note is about a folder of one of the groups, complete seeds or not."""
-    return any(
-        env == group_env and (f"/{method}:" in text or f"/{method}@" in text)
-        for group_env, method in ours
-    )
 
 
 def sweep_table(found: list[Group]) -> pd.DataFrame:

@@ -85,8 +85,6 @@ def mean_cell(values: NDArray[np.float64]) -> str:
 
 
 def _share_cell(values: NDArray[np.float64]) -> str:
-    if not np.isfinite(values).all():
-        return "–"
     hits = int((values > 0).sum())
     return f"{hits}/{len(values)} {_bracket(share_interval(hits, len(values)))}"
 

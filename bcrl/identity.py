@@ -1,0 +1,40 @@
+"""Which part of a config decides numbers, and where two configs differ in it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+Plain = dict[str, Any]  # a resolved config: dicts, lists and scalars
+
+#: Top-level keys that don't belong to a config's identity: they change no number, but
+#: for another device's rounding.
+OUTPUT_KEYS = (
+    *("seeds", "workers", "threads", "device"),
+    *("runs_dir", "tag", "progress", "checkpoint_every"),
+)
+
+
+def identity(config: Plain) -> Plain:
+    """The part of a config that decides numbers."""
+    kept = {k: v for k, v in config.items() if k not in OUTPUT_KEYS}
+    env = {k: v for k, v in kept["env"].items() if k != "paper_seeds"}
+    return kept | {"env": env}
+
+
+def differences(config: Plain, other: Plain) -> dict[str, tuple[Any, Any]]:
+    """Dotted keys at which two configs' identities differ, with both values."""
+    a, b = flat(identity(config)), flat(identity(other))
+    keys = sorted(a.keys() | b.keys())
+    both = {k: (a.get(k, "absent"), b.get(k, "absent")) for k in keys}
+    return {k: (x, y) for k, (x, y) in both.items() if x != y}
+
+
+def flat(config: Plain, prefix: str = "") -> Plain:
+    """Nested dicts as one, with dotted keys."""
+    out: Plain = {}
+    for key, value in config.items():
+        if isinstance(value, dict):
+            out |= flat(value, f"{prefix}{key}.")
+        else:
+            out[f"{prefix}{key}"] = value
+    return out
