@@ -48,8 +48,8 @@ def run(*plans: Plan) -> None:
     plans, stop = tuple(merged(plans)), Stop()
     failed: Failures = {}
     with stop.on_signals(second_ends_all=True):
-        if options["progress"] != "none":
-            _say_what_is_done(plans)
+        for plan in plans:
+            _look_round(plan)
         while (work := ordered(plans, failed)) and not stop.asked:
             _search_references([plan for plan, _ in work])
             if busy := _train(work, options, failed, stop):
@@ -81,7 +81,7 @@ def ordered(plans: Sequence[Plan], failed: Failures) -> list[tuple[Plan, Seeds]]
     pending, work = [], []
     for plan in plans:
         over = failed.get(plan.directory, Failed(plan)).why
-        left = [seed for seed in _pending(plan) if seed not in over]
+        left = [seed for seed in records.pending(plan) if seed not in over]
         for team in checkpoints.teams(plan):
             if set(team) & set(left):
                 work.append((plan, team))
@@ -99,20 +99,15 @@ def ordered(plans: Sequence[Plan], failed: Failures) -> list[tuple[Plan, Seeds]]
     return sorted(work, key=lambda job: -len(job[1]) * costs.expected(job[0]))
 
 
-def _pending(plan: Plan) -> list[int]:
-    """The plan's seeds that are to be trained; what dead processes left is tidied."""
-    seeds = records.pending(plan)
+def _look_round(plan: Plan) -> None:
+    """Check a plan's directory, tidy what dead processes left, say what is done."""
+    records.check_directory(plan)
     locks.tidy(plan.directory)
     checkpoints.remove_done(plan)
-    return seeds
-
-
-def _say_what_is_done(plans: Sequence[Plan]) -> None:
-    for plan in plans:
-        done = len(plan.seeds) - len(records.pending(plan))
-        if done:
-            said = f"{done} of {len(plan.seeds)} seeds complete"
-            print(f"{plan.env} {plan.name}: {said}", file=sys.stderr)
+    done = len(plan.seeds) - len(records.pending(plan))
+    if done and plan.config["progress"] != "none":
+        said = f"{done} of {len(plan.seeds)} seeds complete"
+        print(f"{plan.env} {plan.name}: {said}", file=sys.stderr)
 
 
 def _groups(seeds: list[int], lockstep: int, workers: int) -> list[Seeds]:
@@ -219,7 +214,8 @@ def _wait(busy: Sequence[tuple[Plan, Seeds]], mode: str, stop: Stop) -> None:
 def told(failed: Failures) -> str:
     """What failed, and the commands that run it again."""
     count = sum(len(lost.why) for lost in failed.values())
-    lines = [f"{count} seeds failed, what else was asked for is complete:"]
+    seeds = f"{count} seed{'s' * (count > 1)}"
+    lines = [f"{seeds} failed, what else was asked for is complete:"]
     for lost in failed.values():
         reasons: dict[str, list[int]] = {}
         for seed, why in lost.why.items():
@@ -227,7 +223,7 @@ def told(failed: Failures) -> str:
         for why, seeds in reasons.items():
             name = f"{lost.plan.env} {lost.plan.name}"
             lines.append(f"  {name}, {progress.named(seeds)}: {why}")
-    lines.append("to run just these again:")
+    lines.append(f"to run just {'these' if count > 1 else 'this'} again:")
     lines += [f"  {lost.plan.command}" for lost in failed.values()]
     return "\n".join(lines)
 

@@ -36,6 +36,7 @@ RUNS["dqn in the maze"] = (*DQN[1:], "env=maze", "variant=SBC", "scale.max_steps
 RUNS["fqi on the system"] = ("env=linear_system", "variant=BC", *FQI)
 RUNS["sklearn's forest"] = ("env=car_on_hill", "variant=BC", *FQI)
 RUNS["sklearn's forest"] += ("algorithm/regressor=sklearn_forest", "tag=x")
+RUNS["sklearn's forest"] += ("algorithm.regressor.trees=3",)
 RUNS["the same data"] = ("env=car_on_hill", "variant=B", "algorithm.dataset=shared")
 RUNS["the same data"] += (*FQI, "algorithm.new_data=task", "tag=x")
 LIMIT = 120.0  # seconds for one run, however often it is killed
@@ -85,7 +86,7 @@ class Counter:
         self.fatal, self.written = fatal, 0
 
     def open(self, *arguments):
-        self.file = open(*arguments)
+        self.file = open(*arguments)  # noqa: SIM115
         return self
 
     def write(self, data) -> int:

@@ -110,8 +110,13 @@ def test_evaluating_twice_as_often_leaves_training_unchanged(tmp_path):
             }
 
 
-def test_a_diverging_seed_is_recorded_and_the_run_ends_well(tmp_path, capsys):
-    p = run(tmp_path, *LINEAR, "variant=BC", "algorithm.learning_rate=1e30", "tag=x")
+def test_a_diverging_seed_is_recorded_and_told_at_the_end(tmp_path, capsys):
+    choice = (*LINEAR, "variant=BC", "algorithm.learning_rate=1e30", "tag=x")
+    with pytest.raises(
+        runner.SeedsFailed, match="0–1: non-finite weights at step 2700"
+    ):
+        run(tmp_path, *choice)
+    p = plan(*choice, "scale=smoke", f"runs_dir={tmp_path}")
     about = json.loads((p.directory / "seed_0000.json").read_text())
     assert about["status"] == "failed: non-finite weights at step 2700"
     assert math.isnan(rows(p, 0)[-1]["q_mean"])

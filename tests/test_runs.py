@@ -5,10 +5,7 @@ import hashlib
 import itertools
 import json
 import math
-import os
-import signal
-import subprocess
-import sys
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -139,49 +136,6 @@ def test_measuring_leaves_training_unchanged(tmp_path):
         assert np.array_equal(last.probed_q[seed], final_q(measured, seed))
 
 
-def test_a_run_killed_at_any_moment_resumes_to_the_same_bytes(tmp_path):
-    whole = run(tmp_path / "whole", "maze", "on", "on", "seeds.lockstep=1")
-    program = "import sys; sys.argv[0] = 'bcrl'; from bcrl.cli import main; main()"
-    choice = ["env=maze", "curriculum=on", "boosting=on", "scale=smoke"]
-    where = [f"runs_dir={tmp_path / 'killed'}", "seeds.lockstep=1"]
-    for line in (2, 6):  # in the first seed, then in the second
-        process = subprocess.Popen(
-            [sys.executable, "-c", program, *choice, *where],
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for _ in range(line):
-            process.stderr.readline()
-        process.send_signal(signal.SIGKILL)
-        assert process.wait() == -signal.SIGKILL
-        process.stderr.close()
-    resumed = run(tmp_path / "killed", "maze", "on", "on", "seeds.lockstep=1")
-    for seed in (0, 1):
-        for suffix in ("csv", "npz"):
-            assert digest(whole, seed, suffix) == digest(resumed, seed, suffix)
-
-
-def test_ctrl_c_ends_all_workers_and_keeps_what_is_complete(tmp_path):
-    program = (
-        "import signal, sys; from bcrl.cli import main; sys.argv[0] = 'bcrl';"
-        # A shell's background jobs, and so perhaps this test, ignore it from the start.
-        "signal.signal(signal.SIGINT, signal.default_int_handler); main()"
-    )
-    choice = ["env=maze", "workers=2", "seeds.count=2", f"runs_dir={tmp_path}"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", program, *choice],
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    process.stderr.readline()
-    os.killpg(process.pid, signal.SIGINT)
-    _, said = process.communicate(timeout=30)
-    assert process.returncode == 130
-    assert "interrupted" in said and "Traceback" not in said
-    assert [p.name for p in tmp_path.glob("quick/maze/FQI/*")] == ["config.yaml"]
-
-
 class Broken:
     """A regressor that refuses its work, as a full disk might."""
 
@@ -191,14 +145,57 @@ class Broken:
         raise ConfigError("key", 1, "must be 2")
 
 
-def test_an_error_in_a_worker_ends_the_run_with_its_message(tmp_path):
-    p = plan("env=maze", "scale=smoke", "progress=none", f"runs_dir={tmp_path}")
+def broken(folder: Path, workers: int, *more: str):
+    p = plan("env=maze", "scale=smoke", "progress=none", f"runs_dir={folder}", *more)
     learner = replace(p.stages[0].learner, regressor=Broken())
     stages = (replace(p.stages[0], learner=learner),)
-    broken = replace(p, stages=stages, config=p.config | {"workers": 2})
-    with pytest.raises(ConfigError, match="key=1: must be 2"):
-        runner.run(broken)
-    assert not list(p.directory.glob("seed_*"))
+    return replace(p, stages=stages, config=p.config | {"workers": workers})
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_failing_job_leaves_the_others_alone_and_is_told_at_the_end(
+    tmp_path, workers
+):
+    bad = broken(tmp_path, workers)
+    good = plan(
+        "env=maze", "variant=C", "scale=smoke", "progress=none", f"runs_dir={tmp_path}"
+    )
+    with pytest.raises(runner.SeedsFailed) as failed:
+        runner.run(bad, good)
+    said = str(failed.value)
+    assert "2 seeds failed" in said
+    assert "maze FQI, seeds 0–1: key=1: must be 2" in said
+    assert f"  {bad.command}\n" in said + "\n" and good.command not in said
+    assert all(is_complete(good.directory, seed) for seed in good.seeds)
+    for seed in bad.seeds:
+        about = json.loads((bad.directory / f"seed_{seed:04d}.json").read_text())
+        assert about["status"] == "failed: key=1: must be 2"
+        assert not (bad.directory / f"seed_{seed:04d}.csv").exists()
+    mended = plan(*bad.command.split()[1:])
+    runner.run(mended)  # failed seeds are tried again
+    assert all(is_complete(bad.directory, seed) for seed in bad.seeds)
+
+
+def test_an_unforeseen_error_shows_where_it_came_from(tmp_path, capsys, monkeypatch):
+    p = broken(tmp_path, 1)
+    monkeypatch.setattr(Broken, "fit", lambda *_: 1 / 0)
+    with pytest.raises(runner.SeedsFailed, match="ZeroDivisionError: division by zero"):
+        runner.run(p)
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_sweep_with_a_failing_job_exits_with_1_and_names_the_command(bcrl, tmp_path):
+    sweep = ("env=linear_system", "algorithm=dqn", "variant=BC", "scale=smoke")
+    sweep += ("algorithm.learning_rate=1e-4,1e30", "seeds.count=1")
+    small = ("scale.max_steps=540", "algorithm.evaluation_episodes=3")
+    done = bcrl("-m", *sweep, *small)
+    assert done.returncode == 1, done.stderr
+    assert "1 seed failed" in done.stderr and "Traceback" not in done.stderr
+    command = done.stderr.split("to run just this again:\n  ")[1].splitlines()[0]
+    assert "algorithm.learning_rate=1e+30" in command and "1e-4" not in command
+    assert len(list(tmp_path.glob("runs/smoke/linear_system/*/seed_0000.csv"))) == 2
+    again = bcrl(*shlex.split(command)[1:])
+    assert again.returncode == 1 and "1 seed failed" in again.stderr
 
 
 def test_the_released_maze_and_scikit_learns_forest_run(tmp_path):
