@@ -21,7 +21,7 @@ from bcrl.evaluation import StepProbe
 from bcrl.interrupts import Stop
 from bcrl.locks import Lock, claimed
 from bcrl.probes import Probe
-from bcrl.progress import Tick
+from bcrl.progress import Tick, named
 from bcrl.stage import Course, Snapshot, Team
 
 Seeds = tuple[int, ...]
@@ -82,7 +82,8 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> Outcome:
     except Exception as error:
         if not isinstance(error, BcrlError):  # unforeseen: show where it came from
             traceback.print_exc()
-        print(f"{plan.env} {plan.name}, seeds {mine}: failed", file=sys.stderr)
+        who = f"{plan.env} {plan.name}, {named(mine)}"
+        print(f"{who}: failed: {_reason(error)}", file=sys.stderr)
         return Outcome(dict.fromkeys(mine, _reason(error)))
 
 
