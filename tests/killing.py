@@ -110,6 +110,7 @@ class Counter:
 
 def torment(name: str, folder: Path, rng: random.Random, kills: int) -> dict:
     """A run killed until it was so `kills` times; whether it ends as if it were not."""
+    whole(planned(name, folder / "compiling"))
     calm = planned(name, folder / "calm")
     seconds, size = whole(calm)
     done = rounds = inside = 0
@@ -160,6 +161,7 @@ def race(folder: Path, rng: random.Random, processes: int) -> dict:
     """Several processes at the same seeds, one of them killed; who computed what."""
     name = "maze BC"
     more = ("seeds.count=6", "seeds.lockstep=1", "algorithm.regressor.trees=30")
+    whole(planned(name, folder / "compiling", *more, "tag=x"))
     calm = planned(name, folder / "calm", *more, "tag=x")
     seconds, _ = whole(calm)
     p = planned(name, folder / "raced", *more, "tag=x", "checkpoint_every=0.05")
