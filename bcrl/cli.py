@@ -10,7 +10,7 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from bcrl import config, records, runner, vetting
+from bcrl import guard, records, runner, vetting
 from bcrl.compose import Plan
 from bcrl.errors import BcrlError
 from bcrl.files import make_directory
@@ -20,17 +20,21 @@ REFUSED = 2  # exit code
 
 def main() -> None:
     """Console entry point; refuses bad input with one message before any work."""
-    config.register()
+    guard.register()
     arguments = get_args_parser().parse_intermixed_args()
     # Hydra wants the options before the overrides; people write them anywhere.
     options = [a for a in sys.argv[1:] if a not in arguments.overrides]
     sys.argv[1:] = options + arguments.overrides
     try:
-        plans = _vet(arguments)
-        if plans and not vetting.left_to_hydra(arguments):
-            runner.run(*plans)
-        else:
+        with guard.refusals():
+            plans = _vet(arguments)
+            by_hydra = plans and vetting.left_to_hydra(arguments)
+            if not plans:
+                _run_job()  # shows what is asked for, and exits
+        if by_hydra:
             _run_job()
+        elif plans:
+            runner.run(*plans)
     except BcrlError as error:
         sys.exit(_complain(error))
     except KeyboardInterrupt:
