@@ -49,9 +49,9 @@ def _vet(arguments: Namespace) -> list[Plan]:
     if arguments.config_path:
         raise BcrlError("--config-path: add a folder of your own with --config-dir")
     if arguments.help or arguments.hydra_help or arguments.shell_completion:
-        # Hydra composes for these too, and env is a required choice.
+        # Hydra composes for --help too, and env is a required choice.
         if not any(o.startswith(("env=", "experiment=")) for o in arguments.overrides):
-            sys.argv += ["env=maze"] * (not arguments.shell_completion)
+            sys.argv += ["env=maze"] * arguments.help
         return []
     plans = vetting.plans(arguments)
     if arguments.cfg or arguments.info:

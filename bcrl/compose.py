@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from bcrl.composition import Composition, Plain, composition
 from bcrl.config import OUTPUT_KEYS, Choice, Config, construct, one_of
 from bcrl.envs import Env, env_class
 from bcrl.errors import ConfigError, at_least, did_you_mean
-from bcrl.safety import check_name, check_path
+from bcrl.safety import check_name
 from bcrl.stage import Stage
 from bcrl.transfer import PolicyReuse, ResidualPolicy, Shape
 
@@ -178,15 +177,14 @@ def _check_outputs(config: Plain) -> None:
     at_least("scale.max_steps", scale["max_steps"], 1)
     one_of("progress", config["progress"], ["auto", "bar", "lines", "none"])
     for key, value in (("tag", config["tag"]), ("scale.name", scale["name"])):
-        if value is not None and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", value):
-            raise ConfigError(key, value, "only letters, digits, '.', '_' and '-'")
+        if value is not None:
+            check_name(key, value)
     for key, value, most in (
         ("seeds.first", seeds["first"], 2**32),
         ("seeds.count", seeds["count"], 10**6),
     ):
         if value > most:
             raise ConfigError(key, value, f"must be at most {most}")
-    check_path("runs_dir", config["runs_dir"])
 
 
 def _tasks(section: Plain) -> tuple[list[Env], tuple[str, ...]]:

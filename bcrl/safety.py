@@ -56,8 +56,11 @@ HARMLESS = re.compile(
     r"[A-Z]+_NUM_THREADS|OMP_(PROC_BIND|PLACES|DYNAMIC)|KMP_(AFFINITY|BLOCKTIME)"
     r"|CUDA_(VISIBLE_DEVICES|DEVICE_ORDER)|CUBLAS_WORKSPACE_CONFIG"
 )
-PATHS = ("run.dir", "sweep.dir", "sweep.subdir", "output_subdir")
-NAME = re.compile(r"\w[\w.-]*")
+PATHS = (
+    *("runs_dir", "hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir"),
+    "hydra.output_subdir",
+)
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{,99}")
 COMPONENT, PATH = 200, 2000  # bytes
 
 
@@ -87,16 +90,16 @@ def check(composed: DictConfig) -> None:
     if any(not isinstance(x, (bool, str)) for x in _parts(verbose)):
         raise ConfigError("hydra.verbose", verbose, "must be true or names of loggers")
     for key in PATHS:
-        value = _resolved(composed, f"hydra.{key}")
+        value = _resolved(composed, key)
         if value is not None:
-            check_path(f"hydra.{key}", value)
+            check_path(key, value)
 
 
 def check_name(key: str, text: str) -> None:
     """Raise ConfigError for what isn't a plain name of a file or folder."""
-    if not NAME.fullmatch(text) or len(text.encode()) > COMPONENT:
-        why = "must be a plain name, of letters, digits, '.', '_' and '-'"
-        raise ConfigError(key, repr(text[:40]), why)
+    if not NAME.fullmatch(text):
+        why = "must be a plain name of at most 100 letters, digits, '.', '_' and '-'"
+        raise ConfigError(key, text[:40], why)
 
 
 def check_path(key: str, text: str) -> None:
@@ -169,7 +172,7 @@ def _check_logging(key: str, section: Any) -> None:
     for kind, all_ in named.items():
         _check_keys(f"{key}.{kind}", all_, None)
         for name, settings in all_.items():
-            where = f"{key}.{kind}.{name}"
+            where = f"{key}.{name}" if kind == "root" else f"{key}.{kind}.{name}"
             _check_keys(where, settings, LOGGING_KEYS[kind])
             allowed = LOGGING_CLASSES.get(kind, ())
             made = settings.get("class", next(iter(allowed), None))
@@ -217,4 +220,5 @@ def _resolved(composed: DictConfig, key: str) -> str | None:
         return OmegaConf.select(composed, key)
     except OmegaConfBaseException:
         parent, _, last = key.rpartition(".")
-        return OmegaConf.select(composed, parent)._get_node(last)._value()
+        inside = OmegaConf.select(composed, parent) if parent else composed
+        return OmegaConf.to_container(inside, resolve=False)[last]

@@ -23,7 +23,9 @@ def parse(overrides: Sequence[str]) -> list[Override]:
         try:
             parsed += parser.parse_overrides([override])
         except HydraException as error:
-            raise BcrlError(f"{override!r} can't be read as KEY=VALUE") from error
+            home = "; ~ isn't expanded, write $HOME" * ("=~" in override)
+            text = f"{override!r} can't be read as KEY=VALUE{home}"
+            raise BcrlError(text) from error
     return parsed
 
 

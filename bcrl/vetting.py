@@ -104,8 +104,11 @@ def _refuse_nonsense(
     overrides: Sequence[Override], folders: Folders, arguments: Namespace
 ) -> None:
     """Raise BcrlError for what Hydra would take without a word, or trip over."""
+    asked = [o.get_key_element() for o in overrides if o.key_or_group[:5] == "hydra"]
     for override in overrides:
         key = override.key_or_group
+        if asked.count(override.get_key_element()) > 1:
+            raise BcrlError(f"{key}: given twice; Hydra would merge the values")
         if override.is_delete() and key in VARIANT_GROUPS:
             raise BcrlError(f"{key}: every run needs a choice of it")
         if key == "tuned":

@@ -18,6 +18,8 @@ def algorithm(name: str) -> ModuleType:
     dot is a module of the user's own, as BCRL_TRUST allows.
     """
     if isinstance(name, str) and "." in name:
+        for needed in ("FAMILY", "LOCKSTEP", "stages"):
+            trust.attribute("algorithm.name", name, f"{name}.{needed}")
         return trust.module("algorithm.name", name)
     names = [module.name for module in pkgutil.iter_modules(__path__)]
     if name not in names:
