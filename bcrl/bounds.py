@@ -127,7 +127,7 @@ def check_interpolations(config: dict) -> None:
                 size, height = size + resolved, max(height, 1 + chain)
         asked.pop()
         if height > CHAIN or size > RESOLVED:
-            raise BcrlError(f"{dotted(path) or 'the config'}: {TOO_MUCH}")
+            raise BcrlError(f"{dotted(path)}: {TOO_MUCH}")
         return known.setdefault(path, (size, height))
 
     def refer(path: Keys, found: re.Match) -> tuple[int, int]:
@@ -140,7 +140,8 @@ def check_interpolations(config: dict) -> None:
         there = _find(config, path, key)
         return measure(*there) if there else (0, 0)  # none: OmegaConf says so
 
-    measure((), config)
+    for key in sorted(config, key=lambda key: key == "hydra"):  # it repeats the others
+        measure((key,), config[key])
 
 
 def references(path: Keys, text: str) -> list[re.Match]:

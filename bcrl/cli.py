@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import traceback
 from argparse import Namespace
 
 import hydra
@@ -28,13 +29,9 @@ def main() -> None:
     try:
         with guard.refusals():
             plans = _vet(arguments)
-            by_hydra = plans and vetting.left_to_hydra(arguments)
-            if not plans:
-                _run_job()  # shows what is asked for, and exits
-        if by_hydra:
-            _run_job()
-        elif plans:
-            runner.run(*plans)
+            if not plans or vetting.left_to_hydra(arguments):
+                return _run_job()
+        runner.run(*plans)
     except BcrlError as error:
         sys.exit(_complain(error))
     except KeyboardInterrupt:
@@ -73,6 +70,9 @@ def _run_job(composed: DictConfig) -> None:
         runner.run(vetting.plan(composed, now.choices, folders))
     except BcrlError as error:
         sys.exit(_complain(error))
+    except Exception:  # the job's own, not of what was asked for
+        traceback.print_exc()
+        sys.exit(1)
 
 
 def _complain(error: BcrlError) -> int:

@@ -61,7 +61,7 @@ PATHS = (
     "hydra.output_subdir",
 )
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{,99}")
-COMPONENT, PATH = 200, 2000  # bytes
+COMPONENT, PARTS = 200, 50  # bytes of a part of a path, and how many parts
 
 
 def check(composed: DictConfig) -> None:
@@ -113,8 +113,8 @@ def check_path(key: str, text: str) -> None:
         raise ConfigError(key, text, "leads out of this folder; name it absolutely")
     if not text.isprintable() or "://" in text:
         raise ConfigError(key, repr(text), "isn't the name of a folder")
-    sizes = [len(part.encode()) for part in path.parts]
-    if max(sizes, default=0) > COMPONENT or sum(sizes) > PATH:
+    longest = max((len(part.encode()) for part in path.parts), default=0)
+    if longest > COMPONENT or len(path.parts) > PARTS:
         raise ConfigError(key, f"{text[:40]}…", "is too long for a path")
 
 
@@ -125,19 +125,21 @@ def _check_instantiation(path: tuple, mapping: dict) -> None:
     found = sorted(INSTANTIATING & mapping.keys())
     if not found:
         return
-    target, key = mapping.get("_target_"), dotted((*path, found[-1]))
+    target, key = mapping.get("_target_"), dotted((*path, found[0]))
     section = path[1] if path[:1] == ("hydra",) and len(path) > 1 else None
     if section not in ALLOWED:
-        raise ConfigError(key, mapping[found[-1]], "a config can't instantiate")
+        raise ConfigError(key, mapping[found[0]], "a config can't instantiate")
     if isinstance(target, str) and trust.is_trusted(target.rpartition(".")[0]):
         made = trust.attribute(f"{dotted(path)}._target_", target, target)
         if trust.is_trusted(getattr(made, "__module__", None) or ""):
             return
     top = len(path) == 3 if section == "callbacks" else len(path) == 2
-    if not top or found != ["_target_"] or target not in ALLOWED[section]:
+    if found != ["_target_"]:
+        raise ConfigError(key, mapping[found[0]], "a config can't instantiate so")
+    if not top or target not in ALLOWED[section]:
         known = did_you_mean(str(target), ALLOWED[section])
         why = f"isn't registered; {known}, or a module of yours in {trust.VARIABLE}"
-        raise ConfigError(key, mapping[found[-1]], why)
+        raise ConfigError(key, mapping[found[0]], why)
     for argument in sorted(SHELL & mapping.keys()):
         if mapping[argument]:
             why = f"runs commands; trust the launcher's package with {trust.VARIABLE}"

@@ -84,6 +84,8 @@ def _count(overrides: Sequence[Override]) -> None:
 def first_lines(error: BaseException) -> str:
     """An error's own words, without the key and type listing that OmegaConf appends."""
     lines = str(error).strip().splitlines()
+    if not lines and error.__cause__ is not None:
+        return first_lines(error.__cause__)
     listing = r"\s*(full_key|reference_type|object_type)"
     text = " ".join(x.strip() for x in lines if not re.match(listing, x))
     if error.__cause__ is not None and text.startswith("Error merging"):

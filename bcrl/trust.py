@@ -19,25 +19,24 @@ def is_trusted(name: str) -> bool:
     return any(entry and f"{name}.".startswith(f"{entry}.") for entry in listed)
 
 
-def module(key: str, name: str) -> ModuleType:
-    """The trusted module `name`, imported; ConfigError names `key` if it can't be."""
-    if not is_trusted(name):
+def module(key: str, name: str, where: str) -> ModuleType:
+    """The trusted module `where`, imported; ConfigError if it can't be."""
+    if not all(part.isidentifier() for part in where.split(".")):
+        raise ConfigError(key, name, "isn't the name of a module")
+    if not is_trusted(where):
         why = "isn't of this package; if you trust its code, set the environment "
-        raise ConfigError(key, name, f"{why}variable {VARIABLE}={name.split('.')[0]}")
+        raise ConfigError(key, name, f"{why}variable {VARIABLE}={where.split('.')[0]}")
     try:
-        return importlib.import_module(name)
+        return importlib.import_module(where)
     except Exception as error:  # whatever its code does
         why = f"can't be imported: {type(error).__name__}: {error}"
         raise ConfigError(key, name, why) from error
 
 
 def attribute(key: str, name: str, dotted: str) -> Any:
-    """What the trusted module that `dotted` begins with calls by its last part.
-
-    `name`: how the config says it.
-    """
+    """What the trusted module that `dotted` begins with calls by its last part."""
     where, _, last = dotted.rpartition(".")
-    found = getattr(module(key, where), last, None)
+    found = getattr(module(key, name, where), last, None)
     if found is None:
         raise ConfigError(key, name, f"the module {where} has no {last}")
     return found

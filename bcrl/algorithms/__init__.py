@@ -20,7 +20,7 @@ def algorithm(name: str) -> ModuleType:
     if isinstance(name, str) and "." in name:
         for needed in ("FAMILY", "LOCKSTEP", "stages"):
             trust.attribute("algorithm.name", name, f"{name}.{needed}")
-        return trust.module("algorithm.name", name)
+        return trust.module("algorithm.name", name, name)
     names = [module.name for module in pkgutil.iter_modules(__path__)]
     if name not in names:
         raise ConfigError("algorithm.name", name, did_you_mean(str(name), names))
