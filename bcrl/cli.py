@@ -31,6 +31,7 @@ def main() -> None:
             plans = _vet(arguments)
             if not plans or vetting.left_to_hydra(arguments):
                 return _run_job()
+            make_directory(plans[0].root, "runs_dir")
         runner.run(*plans)
     except BcrlError as error:
         sys.exit(_complain(error))
@@ -55,7 +56,6 @@ def _vet(arguments: Namespace) -> list[Plan]:
         return []
     for plan in plans:
         records.check_directory(plan)
-    make_directory(plans[0].root, "runs_dir")
     return plans
 
 

@@ -148,6 +148,8 @@ def _check_instantiation(path: tuple, mapping: dict) -> None:
         for inner, value in _everything(mapping, path):
             if isinstance(value, str) and not re.fullmatch(r"[^\n\r;`()<>|&]*", value):
                 raise ConfigError(dotted(inner), value, "has characters of a shell")
+            if isinstance(value, str) and str(inner[-1]).endswith("folder"):
+                check_path(dotted(inner), value)
 
 
 def _check_text(path: tuple, section: object) -> None:

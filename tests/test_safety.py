@@ -99,6 +99,13 @@ BAD = {
         f"hydra.launcher._target_={SUBMITIT}",
         "+hydra.launcher.setup=['touch canary']",
     ],
+    "a folder of a launcher": [
+        f"hydra.launcher._target_={SUBMITIT}",
+        "+hydra.launcher.submitit_folder=../x",
+    ],
+    "Hydra's sweep over experiments": [
+        *("-m", "experiment=fig1,fig1_released", "scale=smoke", "hydra.sweep.dir=x"),
+    ],
     "a shell's characters": [
         f"hydra.launcher._target_={SUBMITIT}",
         "+hydra.launcher.comment='$(touch canary)'",
