@@ -6,7 +6,7 @@ from argparse import Namespace
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, Sweep
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -114,8 +114,10 @@ def _refuse_nonsense(
         if key == "tuned":
             raise BcrlError(f"{key}: follows from the other choices; override its keys")
         value = override.value()
-        if value is None and key in (*VARIANT_GROUPS, "variant"):
-            raise BcrlError(f"{key}=null: name an option, or leave {key} out")
+        named = isinstance(value, (str, Sweep))
+        if key in (*VARIANT_GROUPS, "variant", "budget") and not named:
+            text = f"{override.input_line}: name an option, or leave {key} out"
+            raise BcrlError(text)
         if key == "experiment" and isinstance(value, list):
             raise BcrlError("experiment: one at a time, or -m experiment=fig1,fig2")
         if key == "budget":
