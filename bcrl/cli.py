@@ -10,7 +10,7 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from bcrl import config, records, runner, vetting
+from bcrl import guard, records, runner, vetting
 from bcrl.compose import Plan
 from bcrl.errors import BcrlError
 from bcrl.files import make_directory
@@ -18,21 +18,24 @@ from bcrl.interrupts import EXIT_CODE, Interrupted
 
 #: Exit codes, besides 0: seeds failed; bad input or no place to write; a signal.
 FAILED, REFUSED, INTERRUPTED = 1, 2, EXIT_CODE
+_failures: list[int] = []  # exit codes of jobs that Hydra runs, which go on to the next
 
 
 def main() -> None:
     """Console entry point; refuses bad input with one message before any work."""
-    config.register()
+    guard.register()
     arguments = get_args_parser().parse_intermixed_args()
     # Hydra wants the options before the overrides; people write them anywhere.
     options = [a for a in sys.argv[1:] if a not in arguments.overrides]
     sys.argv[1:] = options + arguments.overrides
     try:
-        plans = _vet(arguments)
-        if plans and not vetting.left_to_hydra(arguments):
-            runner.run(*plans)
-        else:
-            _run_job()
+        with guard.refusals():
+            plans = _vet(arguments)
+            if not plans or vetting.left_to_hydra(arguments):
+                _run_job()
+                sys.exit(max(_failures, default=0))
+            make_directory(plans[0].root, "runs_dir")
+        runner.run(*plans)
     except runner.SeedsFailed as error:
         sys.exit(_complain(error, FAILED))
     except BcrlError as error:
@@ -50,16 +53,15 @@ def _vet(arguments: Namespace) -> list[Plan]:
     if arguments.config_path:
         raise BcrlError("--config-path: add a folder of your own with --config-dir")
     if arguments.help or arguments.hydra_help or arguments.shell_completion:
-        # Hydra composes for these too, and env is a required choice.
+        # Hydra composes for --help too, and env is a required choice.
         if not any(o.startswith(("env=", "experiment=")) for o in arguments.overrides):
-            sys.argv += ["env=maze"] * (not arguments.shell_completion)
+            sys.argv += ["env=maze"] * arguments.help
         return []
     plans = vetting.plans(arguments)
     if arguments.cfg or arguments.info:
         return []
     for plan in plans:
         records.check_directory(plan)
-    make_directory(plans[0].root, "runs_dir")
     return plans
 
 
@@ -70,7 +72,13 @@ def _run_job(composed: DictConfig) -> None:
     """One job of Hydra's: its composed config is planned and run."""
     now = HydraConfig.get().runtime
     folders = [source.path for source in now.config_sources if source.schema == "file"]
-    runner.run(vetting.plan(composed, now.choices, folders))
+    try:
+        runner.run(vetting.plan(composed, now.choices, folders))
+    except BcrlError as error:
+        if not HydraConfig.get().launcher["_target_"].endswith("BasicLauncher"):
+            raise  # in a process of the launcher's: it tells Hydra
+        failed = isinstance(error, runner.SeedsFailed)
+        _failures.append(_complain(error, FAILED if failed else REFUSED))
 
 
 def _complain(error: BcrlError, code: int) -> int:

@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import json
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from bcrl.config import Choice, Config, construct, one_of
 from bcrl.envs import Env, env_class
 from bcrl.errors import ConfigError, at_least, did_you_mean
 from bcrl.identity import Plain, differences
+from bcrl.safety import check_name
 from bcrl.stage import Stage
 from bcrl.transfer import PolicyReuse, ResidualPolicy, Shape
 
@@ -75,6 +75,7 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
     the name of the `env` choice.
     """
     _check_outputs(config)
+    check_name("env", env)
     tasks, metrics = _tasks(config["env"])
     section = config["algorithm"]
     if not isinstance(section, dict):
@@ -108,7 +109,7 @@ def _variant(algorithm_name: str, chosen: Composition) -> str:
     """`SBC-DQN` and the like; policy reuse and residual policy by their own names."""
     prefix = "S" * isinstance(chosen.transfer, Shape)
     prefix += "B" * (chosen.boost is not None) + "C" * (not chosen.target_only)
-    name = algorithm_name.upper()
+    name = algorithm_name.rpartition(".")[2].upper()
     whole = f"{prefix}-{name}" if prefix else name
     if isinstance(chosen.transfer, ResidualPolicy):
         return "RPL"
@@ -156,10 +157,14 @@ def _check_outputs(config: Plain) -> None:
         raise ConfigError("checkpoint_every", config["checkpoint_every"], why)
     one_of("progress", config["progress"], ["auto", "bar", "lines", "none"])
     for key, value in (("tag", config["tag"]), ("scale.name", scale["name"])):
-        if value is not None and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", value):
-            raise ConfigError(key, value, "only letters, digits, '.', '_' and '-'")
-    if not config["runs_dir"].strip():
-        raise ConfigError("runs_dir", "''", "must name a folder")
+        if value is not None:
+            check_name(key, value)
+    for key, value, most in (
+        ("seeds.first", seeds["first"], 2**32),
+        ("seeds.count", seeds["count"], 10**6),
+    ):
+        if value > most:
+            raise ConfigError(key, value, f"must be at most {most}")
 
 
 def _tasks(section: Plain) -> tuple[list[Env], tuple[str, ...]]:

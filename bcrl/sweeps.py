@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
 from hydra.errors import HydraException
 
+from bcrl.bounds import JOBS, check_override
 from bcrl.errors import BcrlError
 
 
@@ -17,10 +19,13 @@ def parse(overrides: Sequence[str]) -> list[Override]:
     """A command line's overrides; BcrlError names one that is none."""
     parser, parsed = OverridesParser.create(), []
     for override in overrides:
+        check_override(override)
         try:
             parsed += parser.parse_overrides([override])
         except HydraException as error:
-            raise BcrlError(f"{override!r} can't be read as KEY=VALUE") from error
+            home = "; ~ isn't expanded, write $HOME" * ("=~" in override)
+            text = f"{override!r} can't be read as KEY=VALUE{home}"
+            raise BcrlError(text) from error
     return parsed
 
 
@@ -38,6 +43,7 @@ def experiments(overrides: list[Override], multirun: bool) -> Iterator[list[Over
     if not multirun:
         raise BcrlError("experiment: several values are a sweep; add -m")
     rest = [o for o in overrides if o not in chosen]
+    _count(chosen)
     try:
         names = list(chosen[-1].sweep_string_iterator())
     except HydraException as error:
@@ -49,15 +55,37 @@ def experiments(overrides: list[Override], multirun: bool) -> Iterator[list[Over
 
 def product(overrides: list[Override]) -> list[list[str]]:
     """The overrides of each job: every combination of the swept values."""
+    _count(overrides)
     try:
         return BasicSweeper.split_arguments(overrides, None)[0]
     except HydraException as error:
         raise BcrlError(first_lines(error)) from error
 
 
+def _count(overrides: Sequence[Override]) -> None:
+    """Raise BcrlError for a sweep over more jobs than anyone can mean."""
+    jobs = 1.0
+    for override in overrides:
+        sweep = override.value()
+        if isinstance(sweep, ChoiceSweep):
+            jobs *= len(sweep.list)
+        elif isinstance(sweep, RangeSweep):
+            try:
+                jobs *= max(0.0, (sweep.stop - sweep.start) / sweep.step)
+            except (ArithmeticError, TypeError):  # a step of 0, a number out of range
+                jobs = math.inf
+        if not 0 < jobs <= JOBS:
+            text = (
+                f"{override.input_line}: a sweep of more than {JOBS} jobs, or of none"
+            )
+            raise BcrlError(text)
+
+
 def first_lines(error: BaseException) -> str:
     """An error's own words, without the key and type listing that OmegaConf appends."""
     lines = str(error).strip().splitlines()
+    if not lines and error.__cause__ is not None:
+        return first_lines(error.__cause__)
     listing = r"\s*(full_key|reference_type|object_type)"
     text = " ".join(x.strip() for x in lines if not re.match(listing, x))
     if error.__cause__ is not None and text.startswith("Error merging"):

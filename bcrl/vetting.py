@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from argparse import Namespace
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
-from hydra import compose as hydra_compose
-from hydra import initialize_config_dir
-from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException, MissingConfigException
+from hydra.core.override_parser.types import Override, Sweep
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bcrl import compose
 from bcrl.compose import Plan
+from bcrl.composed import CONF, CONFIG_NAME, Folders, composed
 from bcrl.errors import BcrlError, did_you_mean
-from bcrl.identity import Plain, differences, flat
+from bcrl.identity import Plain, differences
 from bcrl.sweeps import experiments, first_lines, over_experiments, parse, product
 
-PACKAGE = Path(__file__).resolve().parent
-#: In a wheel the configs lie inside the package, in a checkout beside it.
-CONF = next(p for p in (PACKAGE / "conf", PACKAGE.parent / "conf") if p.is_dir())
-CONFIG_NAME = "config"
 #: The choices that make a variant; a run is compared with these at their defaults.
 VARIANT_GROUPS = ("env", "algorithm", "curriculum", "boosting", "transfer", "scale")
 #: The options that follow the authors' code, and the tag of runs that choose them all.
@@ -41,7 +33,6 @@ RUNNING = (
     *("launcher", "callbacks", "output_subdir", "run", "sweep"),
     *("job_logging", "hydra_logging", "verbose"),
 )
-Folders = tuple[str, ...]  # of configs, besides our own
 
 
 def plans(arguments: Namespace) -> list[Plan]:
@@ -72,7 +63,7 @@ def left_to_hydra(arguments: Namespace) -> bool:
     Then Hydra runs them one by one, or hands them to a launcher. Raises BcrlError for a
     sweep over experiments, which Hydra can't run.
     """
-    usual = _running(_compose(CONFIG_NAME, ("env=maze",), ()))
+    usual = _running(composed(CONFIG_NAME, ("env=maze",), ()))
     for job in _composed(arguments)[1]:
         asked = [k for k, value in _running(job).items() if value != usual[k]]
         if asked and any(map(over_experiments, parse(arguments.overrides))):
@@ -83,9 +74,9 @@ def left_to_hydra(arguments: Namespace) -> bool:
     return False
 
 
-def _running(composed: DictConfig) -> Plain:
+def _running(job: DictConfig) -> Plain:
     """What Hydra's part of a config says of running jobs."""
-    hydra = OmegaConf.to_container(composed.hydra, resolve=False)
+    hydra = OmegaConf.to_container(job.hydra, resolve=False)
     kept = {key: hydra.get(key) for key in RUNNING}
     return kept | {
         "sweeper": hydra["sweeper"]["_target_"],
@@ -110,7 +101,7 @@ def _composed(arguments: Namespace) -> tuple[Folders, list[DictConfig]]:
     _refuse_nonsense(parsed, folders, arguments)
     multirun = bool(arguments.multirun)
     return folders, [
-        _compose(name, tuple(job), folders)
+        composed(name, tuple(job), folders)
         for overrides in experiments(parsed, multirun)
         for job in _jobs(name, overrides, multirun, folders)
     ]
@@ -130,15 +121,20 @@ def _refuse_nonsense(
     overrides: Sequence[Override], folders: Folders, arguments: Namespace
 ) -> None:
     """Raise BcrlError for what Hydra would take without a word, or trip over."""
+    asked = [o.get_key_element() for o in overrides if o.key_or_group[:5] == "hydra"]
     for override in overrides:
         key = override.key_or_group
+        if asked.count(override.get_key_element()) > 1:
+            raise BcrlError(f"{key}: given twice; Hydra would merge the values")
         if override.is_delete() and key in VARIANT_GROUPS:
             raise BcrlError(f"{key}: every run needs a choice of it")
         if key == "tuned":
             raise BcrlError(f"{key}: follows from the other choices; override its keys")
         value = override.value()
-        if value is None and key in (*VARIANT_GROUPS, "variant"):
-            raise BcrlError(f"{key}=null: name an option, or leave {key} out")
+        named = isinstance(value, (str, Sweep))
+        if key in (*VARIANT_GROUPS, "variant", "budget") and not named:
+            text = f"{override.input_line}: name an option, or leave {key} out"
+            raise BcrlError(text)
         if key == "experiment" and isinstance(value, list):
             raise BcrlError("experiment: one at a time, or -m experiment=fig1,fig2")
         if key == "budget":
@@ -159,18 +155,16 @@ def _check_budgets(names: Iterable[object], folders: Folders) -> None:
             raise BcrlError(f"budget={name}: {did_you_mean(name, known)}")
 
 
-def plan(
-    composed: DictConfig, choices: Mapping[str, str], folders: Sequence[str]
-) -> Plan:
+def plan(job: DictConfig, choices: Mapping[str, str], folders: Sequence[str]) -> Plan:
     """The plan of one composed config, made with these group choices."""
     for group in VARIANT_GROUPS:
         if choices.get(group) is None:
             raise BcrlError(f"{group}: every run needs a choice of it")
     extra = tuple(f for f in folders if Path(f) != CONF)
-    config, known = _plain(composed), {}
+    config, known = _plain(job), {}
     for tag, released in ((None, False), (RELEASED, True)):
         variant = (f"env={choices['env']}", *_usual(config, choices, released))
-        known[tag] = _plain(_compose(CONFIG_NAME, variant, extra))
+        known[tag] = _plain(composed(CONFIG_NAME, variant, extra))
         if not differences(config, known[tag]):
             break
     return compose.plan(config, known, choices["env"])
@@ -192,10 +186,10 @@ def _usual(config: Plain, choices: Mapping[str, str], released: bool) -> Iterato
         yield f"{group}={name if shipped else choices[group]}"
 
 
-def _plain(composed: DictConfig) -> Plain:
-    job = OmegaConf.masked_copy(composed, [k for k in composed if k != "hydra"])
+def _plain(job: DictConfig) -> Plain:
+    ours = OmegaConf.masked_copy(job, [k for k in job if k != "hydra"])
     try:
-        return OmegaConf.to_container(job, resolve=True, throw_on_missing=True)
+        return OmegaConf.to_container(ours, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
         raise BcrlError(first_lines(error)) from error
 
@@ -205,7 +199,7 @@ def _jobs(
 ) -> list[list[str]]:
     """Each job's overrides: the product of what the command line and config sweep."""
     jobs = product(overrides)
-    first = _compose(name, tuple(jobs[0]), folders).hydra
+    first = composed(name, tuple(jobs[0]), folders).hydra
     if not multirun and first.mode != RunMode.MULTIRUN:
         swept = [o.key_or_group for o in overrides if o.is_sweep_override()]
         if swept:
@@ -225,51 +219,3 @@ def _refuse_collisions(planned: Sequence[Plan]) -> None:
             key, (a, b) = next(iter(changed.items()))
             why = f"both {key}={a} and {key}={b} would write to {new.directory}"
             raise BcrlError(f"tag={new.tag}: {why}; drop the tag or vary it too")
-
-
-@cache
-def _compose(name: str, overrides: tuple[str, ...], folders: Folders) -> DictConfig:
-    """Hydra's composition of one job, its errors made short."""
-    extra = [f"file://{folder}" for folder in folders]
-    path = [f"hydra.searchpath=[{','.join(extra)}]"] if extra else []
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        try:
-            return hydra_compose(name, [*overrides, *path], return_hydra_config=True)
-        except MissingConfigException as error:
-            raise BcrlError(_missing(error)) from error
-        except (HydraException, OmegaConfBaseException) as error:
-            message = first_lines(error)
-        except Exception as error:  # e.g. YAML's own; composing runs nothing of ours
-            hint = "; quote on and off, YAML takes them for booleans" * (
-                "in defaults : bool" in str(error)
-            )
-            text = f"the configs can't be read: {first_lines(error)}{hint}"
-            raise BcrlError(text) from error
-        unknown = re.match(r"Could not override '([^']+)'", message)
-        if unknown:
-            message = f"{unknown[1]}: unknown key; " + _known_keys(
-                name, unknown[1], overrides, path
-            )
-        raise BcrlError(message)
-
-
-def _missing(error: MissingConfigException) -> str:
-    wanted = error.missing_cfg_file or ""
-    group, _, option = wanted.rpartition("/")
-    if not group or error.options is None:
-        return first_lines(error)
-    return f"{group}={option}: {did_you_mean(option, error.options)}"
-
-
-def _known_keys(
-    name: str, key: str, overrides: Sequence[str], path: Sequence[str]
-) -> str:
-    """What `key` may have meant, among the keys of the same choice of groups."""
-    groups = [o for o in overrides if "." not in o.split("=")[0] and o[0] not in "+~"]
-    for asked in (groups, ["env=maze"]):
-        try:
-            composed = hydra_compose(name, [*asked, *path])
-        except (HydraException, OmegaConfBaseException):
-            continue
-        return did_you_mean(key, flat(OmegaConf.to_container(composed)))
-    return "see bcrl --help"

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from bcrl import config, vetting
+from bcrl import guard, vetting
 from bcrl.compose import Plan
 
-config.register()
+guard.register()
 
 
 def arguments(

@@ -73,6 +73,8 @@ BAD = {
         ["curriculum.foo", "unknown"],
     ),
     "deleted group": ([MAZE, "~transfer"], ["transfer", "needs a choice"]),
+    "a number for an option": ([MAZE, "algorithm=2.5"], ["algorithm=2.5", "an option"]),
+    "a list of options": ([MAZE, "variant=[1]"], ["variant=[1]", "name an option"]),
     "metric no name": ([MAZE, "env.metrics=[[return]]"], ["env.metrics"]),
     "no searchpath": ([MAZE, "hydra.searchpath=[/no/where]"], ["/no/where"]),
     "unspeakable tag": ([MAZE, "tag=a/b"], ["tag=a/b", "letters"]),

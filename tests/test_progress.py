@@ -31,9 +31,12 @@ def test_hydras_own_launchers_get_one_experiment_at_a_time():
 
 def test_who_runs_the_jobs_is_read_from_the_composed_config(tmp_path):
     assert not vetting.left_to_hydra(arguments("experiment=fig2", multirun=True))
-    assert vetting.left_to_hydra(arguments("env=maze", "+hydra.job.env_set.A=1"))
+    assert vetting.left_to_hydra(
+        arguments("env=maze", "+hydra.job.env_set.OMP_NUM_THREADS=1")
+    )
     (tmp_path / "experiment").mkdir()
-    own = "# @package _global_\nhydra: {callbacks: {mine: {_target_: a.B}}}\n"
+    log = "hydra.experimental.callbacks.LogJobReturnCallback"
+    own = f"# @package _global_\nhydra: {{callbacks: {{mine: {{_target_: {log}}}}}}}\n"
     (tmp_path / "experiment/own.yaml").write_text(own)
     given = arguments("env=maze", "experiment=own", config_dir=str(tmp_path))
     assert vetting.left_to_hydra(given)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 
+from bcrl import trust
 from bcrl.envs.base import Env, FiniteEnv, is_finite
 from bcrl.errors import BcrlError, did_you_mean
 
@@ -18,7 +19,12 @@ def env_names() -> list[str]:
 
 
 def env_class(name: str) -> type:
-    """The environment class called `name`; BcrlError if there is none."""
+    """The environment class called `name`; BcrlError if there is none.
+
+    A name with a dot is a module of the user's own, as BCRL_TRUST allows.
+    """
+    if "." in name:
+        return trust.component("env.name", name, f"{name}.ENV")
     if name not in env_names():
         raise BcrlError(f"env.name={name}: {did_you_mean(name, env_names())}")
     return importlib.import_module(f"bcrl.envs.{name}").ENV

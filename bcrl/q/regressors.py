@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl import trust
 from bcrl.errors import ConfigError, at_least, did_you_mean
 from bcrl.pack import DERIVED, storable
 from bcrl.q import Values, forest
@@ -213,7 +214,12 @@ REGRESSORS = {
 
 
 def regressor_class(name: str) -> type:
-    """The regressor class called `name` in `algorithm.regressor.name`."""
+    """The regressor class called `name` in `algorithm.regressor.name`.
+
+    A name with a dot, `package.module.Class`, is the user's own, as BCRL_TRUST allows.
+    """
+    if "." in name:
+        return trust.component("algorithm.regressor.name", name, name)
     if name not in REGRESSORS:
         raise ConfigError(
             "algorithm.regressor.name", name, did_you_mean(name, REGRESSORS)

@@ -1,0 +1,91 @@
+"""Where Hydra reads and composes: every file and config is checked before it acts."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import hydra._internal.hydra as hydra_internals
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.core_plugins.importlib_resources_config_source import (
+    ImportlibResourcesConfigSource,
+)
+from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.plugins import Plugins
+from hydra.errors import CompactHydraException
+from hydra.plugins.config_source import ConfigResult
+from omegaconf import DictConfig
+
+from bcrl import bounds, config, safety
+from bcrl.errors import BcrlError
+
+FULL_ERROR = "HYDRA_FULL_ERROR"
+
+
+class Refused(BcrlError, CompactHydraException):
+    """A refusal that Hydra, too, prints without a traceback."""
+
+
+class Files(FileConfigSource):
+    """A folder of configs; those of the user's own are plain, small data within it."""
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        name = os.path.normpath(self._normalize_file_name(config_path))
+        if os.path.isabs(name) or name.startswith(".."):
+            raise Refused(f"{config_path}: leads out of the folder {self.path}")
+        if self.provider != "main":
+            bounds.check_file(Path(self.path, name))
+        return super().load_config(config_path)
+
+
+class Packages(ImportlibResourcesConfigSource):
+    """A package of configs; reading one imports it, so a config can't name any."""
+
+    def __init__(self, provider: str, path: str) -> None:
+        if provider.startswith("hydra.searchpath"):
+            raise Refused(f"hydra.searchpath: {path} would import code; name a folder")
+        super().__init__(provider, path)
+
+
+class Loader(ConfigLoaderImpl):
+    """Composes as Hydra does, and lets nothing out that `safety.check` refuses."""
+
+    def load_configuration(self, *args: Any, **kwargs: Any) -> DictConfig:
+        composed = super().load_configuration(*args, **kwargs)
+        try:
+            safety.check(composed)
+        except BcrlError as error:
+            raise Refused(str(error)) from error
+        return composed
+
+
+def register() -> None:
+    """Make the schema known to Hydra, and let it read and compose by these classes."""
+    config.register()
+    Plugins.instance()  # registers Hydra's own
+    SourcesRegistry.instance().types |= {"file": Files, "pkg": Packages}
+    hydra_internals.ConfigLoaderImpl = Loader
+
+
+@contextmanager
+def refusals() -> Iterator[None]:
+    """Make a BcrlError of whatever goes wrong; HYDRA_FULL_ERROR=1 shows where."""
+    before = os.environ.get(FULL_ERROR)
+    os.environ[FULL_ERROR] = "1"  # Hydra would print a traceback and exit
+    try:
+        yield
+    except BcrlError:
+        raise
+    except Exception as error:
+        if before == "1":
+            raise
+        words = " ".join(str(error).split()) or "no further words"
+        why = f"{type(error).__name__}: {words}; {FULL_ERROR}=1 shows where"
+        raise BcrlError(why) from error
+    finally:
+        os.environ.pop(FULL_ERROR)
+        os.environ.update({} if before is None else {FULL_ERROR: before})

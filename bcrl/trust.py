@@ -1,0 +1,50 @@
+"""Modules of the user's own that a config may name: BCRL_TRUST=my_package,my.module."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import os
+from types import ModuleType
+from typing import Any
+
+from bcrl.errors import ConfigError
+
+VARIABLE = "BCRL_TRUST"  # of the process's environment; no config can set it
+
+
+def is_trusted(name: str) -> bool:
+    """Whether `name` is a module that BCRL_TRUST lists, or lies below one."""
+    listed = [entry.strip() for entry in os.environ.get(VARIABLE, "").split(",")]
+    return any(entry and f"{name}.".startswith(f"{entry}.") for entry in listed)
+
+
+def module(key: str, name: str, where: str) -> ModuleType:
+    """The trusted module `where`, imported; ConfigError if it can't be."""
+    if not all(part.isidentifier() for part in where.split(".")):
+        raise ConfigError(key, name, "isn't the name of a module")
+    if not is_trusted(where):
+        why = "isn't of this package; if you trust its code, set the environment "
+        raise ConfigError(key, name, f"{why}variable {VARIABLE}={where.split('.')[0]}")
+    try:
+        return importlib.import_module(where)
+    except Exception as error:  # whatever its code does
+        why = f"can't be imported: {type(error).__name__}: {error}"
+        raise ConfigError(key, name, why) from error
+
+
+def attribute(key: str, name: str, dotted: str) -> Any:
+    """What the trusted module that `dotted` begins with calls by its last part."""
+    where, _, last = dotted.rpartition(".")
+    found = getattr(module(key, name, where), last, None)
+    if found is None:
+        raise ConfigError(key, name, f"the module {where} has no {last}")
+    return found
+
+
+def component(key: str, name: str, dotted: str) -> type:
+    """The dataclass at `dotted`, as `attribute` finds it."""
+    found = attribute(key, name, dotted)
+    if not (isinstance(found, type) and dataclasses.is_dataclass(found)):
+        raise ConfigError(key, name, f"{dotted} must be a frozen dataclass")
+    return found
