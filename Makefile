@@ -52,6 +52,7 @@ bench: $(READY) ## speed, as ratios against the plain way in one run
 	$(BIN)/python bench/growth.py
 	$(BIN)/python bench/dqn.py
 	$(BIN)/python bench/methods.py
+	$(BIN)/python bench/checkpoints.py
 	test ! -d runs/paper || $(BIN)/python bench/paper.py
 
 bench-peer: $(READY) ## the same against MushroomRL 1.10.2, in an environment of its own

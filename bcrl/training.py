@@ -84,7 +84,8 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> Outcome:
             traceback.print_exc()
         who = f"{plan.env} {plan.name}, {named(mine)}"
         print(f"{who}: failed: {_reason(error)}", file=sys.stderr)
-        return Outcome(dict.fromkeys(mine, _reason(error)))
+        lost = [s for s in mine if not records.is_complete(directory, s)]
+        return Outcome(dict.fromkeys(lost, _reason(error)))
 
 
 def _share(job: Job, held: Mapping[int, Lock]) -> tuple[Seeds, Seeds, bool]:

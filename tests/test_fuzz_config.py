@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from bcrl import cli, runner
-from bcrl.compose import flat
+from bcrl.identity import flat
 from bcrl.composed import CONF, composed
 
 EXAMPLES = int(os.environ.get("BCRL_FUZZ", "90"))
