@@ -126,7 +126,8 @@ class _Packer:
         order = (
             "F" if array.flags.f_contiguous and not array.flags.c_contiguous else "C"
         )
-        self.bytes.append(array.reshape(-1, order=order).view(np.uint8))
+        flat = np.ascontiguousarray(array.reshape(-1, order=order))
+        self.bytes.append(flat.view(np.uint8))
         at, self._length = self._length, self._length + array.nbytes
         return [kind, [at, array.dtype.str, list(array.shape), order]]
 

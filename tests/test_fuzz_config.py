@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from bcrl import cli, runner
-from bcrl.identity import flat
 from bcrl.composed import CONF, composed
+from bcrl.identity import flat
 
 EXAMPLES = int(os.environ.get("BCRL_FUZZ", "90"))
 SHOWING = ("--help", "-h", "--hydra-help", "--version", "--cfg", "-c", "--info", "-i")

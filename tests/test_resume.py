@@ -21,7 +21,7 @@ from tests.conftest import plan
 from tests.test_runs import digest
 
 KILLS = int(os.environ.get("BCRL_KILLS", "0"))
-FEW = ("maze C", "car_on_hill BC", "dqn C", "dqn SBC", "sklearn's forest")
+FEW = ("maze C", "car_on_hill BC", "dqn C", "dqn SBC")
 ROOT = Path(__file__).parent.parent
 
 
