@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Sequence
@@ -10,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from bcrl import pack
+from bcrl import pack, trust
 from bcrl.compose import Plan
 from bcrl.errors import BcrlError
 from bcrl.files import write_atomically
@@ -54,12 +55,18 @@ def teams(plan: Plan) -> list[Seeds]:
     return found
 
 
+def remove(plan: Plan, seeds: Seeds) -> None:
+    """Remove a team's checkpoint, if there is one."""
+    _path(plan, seeds).unlink(missing_ok=True)
+
+
 def remove_done(plan: Plan) -> None:
     """Remove checkpoints all of whose seeds are complete."""
     for path in _paths(plan):
-        seeds = _read_about(path).get("seeds", ())
-        if all(is_complete(plan.directory, seed) for seed in seeds):
-            path.unlink(missing_ok=True)
+        with contextlib.suppress(BcrlError):  # who asks for its seeds will be told
+            seeds = _read_about(path).get("seeds", ())
+            if all(is_complete(plan.directory, seed) for seed in seeds):
+                path.unlink(missing_ok=True)
 
 
 def _paths(plan: Plan) -> list[Path]:
@@ -98,11 +105,12 @@ def _about(plan: Plan) -> dict[str, Any]:
 
 @cache
 def _code() -> str:
-    """A fingerprint of all that computes: our sources and the libraries' versions."""
+    """A fingerprint of all that computes: sources, the user's too, and libraries."""
     package = Path(__file__).resolve().parent
+    ours = sorted(package.rglob("*.py"))
+    computing = [p for p in ours if "report" not in p.relative_to(package).parts]
     code = hashlib.sha256()
-    for source in sorted(package.rglob("*.py")):
-        if "report" not in source.relative_to(package).parts:
-            code.update(source.read_bytes())
+    for source in (*computing, *trust.sources()):
+        code.update(source.read_bytes())
     code.update(repr([version(name) for name in LIBRARIES]).encode())
     return code.hexdigest()

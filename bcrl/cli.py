@@ -15,6 +15,7 @@ from bcrl.compose import Plan
 from bcrl.errors import BcrlError
 from bcrl.files import make_directory
 from bcrl.interrupts import EXIT_CODE, Interrupted
+from bcrl.terminal import say
 
 #: Exit codes, besides 0: seeds failed; bad input or no place to write; a signal.
 FAILED, REFUSED, INTERRUPTED = 1, 2, EXIT_CODE
@@ -42,7 +43,7 @@ def main() -> None:
         sys.exit(_complain(error, REFUSED))
     except (Interrupted, KeyboardInterrupt):
         text = "interrupted; run the same command again to go on from here"
-        print(f"bcrl: {text}", file=sys.stderr)
+        say(f"bcrl: {text}")
         sys.exit(INTERRUPTED)
 
 
@@ -70,17 +71,18 @@ def _vet(arguments: Namespace) -> list[Plan]:
 )
 def _run_job(composed: DictConfig) -> None:
     """One job of Hydra's: its composed config is planned and run."""
-    now = HydraConfig.get().runtime
-    folders = [source.path for source in now.config_sources if source.schema == "file"]
+    own = HydraConfig.get()
+    sources = own.runtime.config_sources
+    folders = [source.path for source in sources if source.schema == "file"]
     try:
-        runner.run(vetting.plan(composed, now.choices, folders))
+        runner.run(vetting.plan(composed, own, folders))
     except BcrlError as error:
-        if not HydraConfig.get().launcher["_target_"].endswith("BasicLauncher"):
+        if not own.launcher["_target_"].endswith("BasicLauncher"):
             raise  # in a process of the launcher's: it tells Hydra
         failed = isinstance(error, runner.SeedsFailed)
         _failures.append(_complain(error, FAILED if failed else REFUSED))
 
 
 def _complain(error: BcrlError, code: int) -> int:
-    print(f"bcrl: {error}", file=sys.stderr)
+    say(f"bcrl: {error}")
     return code

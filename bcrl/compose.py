@@ -38,7 +38,7 @@ class Plan:
     lockstep: int
     device: str
     config: Plain  # resolved, whole
-    command: str = "bcrl"  # what runs this plan alone
+    command: str = ""  # what runs this plan alone, a line each if there are several
 
     @property
     def target(self) -> Env:

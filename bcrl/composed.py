@@ -46,7 +46,10 @@ def composed(name: str, overrides: tuple[str, ...], folders: Folders) -> DictCon
         text = f"the configs can't be read: {first_lines(error)}{hint}"
         raise BcrlError(text) from error
     if unknown := re.match(r"Could not override '([^']+)'", message):
-        known = _known_keys(name, unknown[1], overrides, folders)
+        key = unknown[1]
+        add = f"one that isn't there is added with +{key}"
+        ours = not key.startswith("hydra.")
+        known = _known_keys(name, key, overrides, folders) if ours else add
         message = f"{unknown[1]}: unknown key; {known}"
     raise BcrlError(message)
 

@@ -10,8 +10,12 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
-#: Ctrl-C, a scheduler's end, and the early warnings that one may ask Slurm for.
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
+from bcrl.terminal import GONE
+
+#: Ctrl-C, a scheduler's end, a lost terminal, and the early warnings that one may ask
+#: Slurm for.
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+SIGNALS += (signal.SIGUSR1, signal.SIGUSR2)
 EXIT_CODE = 75  # EX_TEMPFAIL: nothing is wrong, run the same command again
 
 
@@ -31,7 +35,10 @@ class Stop:
 
     @contextlib.contextmanager
     def on_signals(self, second_ends_all: bool) -> Iterator[None]:
-        """Meanwhile signals only ask; a second one may end the process at once."""
+        """Meanwhile signals only ask; a second one may end the process at once.
+
+        Those that are ignored (as by nohup) stay so.
+        """
         if threading.current_thread() is not threading.main_thread():
             yield  # whose thread it is gets the signals
             return
@@ -44,11 +51,12 @@ class Stop:
                 name = signal.Signals(number).name
                 # Not print: the signal may have come in the middle of one.
                 text = f"bcrl: {name}: saving; once more to quit at once\n"
-                with contextlib.suppress(OSError):
+                with contextlib.suppress(*GONE):
                     os.write(sys.__stderr__.fileno(), text.encode())
             self.ask()
 
-        before = {number: signal.signal(number, note) for number in SIGNALS}
+        heard = [n for n in SIGNALS if signal.getsignal(n) is not signal.SIG_IGN]
+        before = {number: signal.signal(number, note) for number in heard}
         try:
             yield
         finally:

@@ -68,7 +68,8 @@ class Lock:
         """Give the lock up, its file removed."""
         if self._handle is not None:
             if self._is_at_path(self._handle):
-                self.path.unlink(missing_ok=True)
+                with contextlib.suppress(OSError):  # the lock counts, not its file
+                    self.path.unlink()
             os.close(self._handle)
             self._handle = None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import sys
 import time
@@ -9,6 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from tqdm import tqdm
+
+from bcrl.terminal import GONE, say
 
 LINE_EVERY = 0.1  # share of the work between two lines, where no job ends
 SILENCE = 30.0  # seconds after which a line is due anyhow
@@ -43,7 +46,7 @@ class Progress:
 
     def __init__(self, jobs: Sequence[Job], workers: int, mode: str) -> None:
         if mode == "auto":
-            mode = "bar" if sys.stderr.isatty() else "lines"
+            mode = "bar" if getattr(sys.stderr, "isatty", bool)() else "lines"
         self.jobs, self.workers, self.mode = jobs, workers, mode
         self.share = [0.0] * len(jobs)  # of each job, done
         self.spent = [0.0] * len(jobs)
@@ -71,14 +74,15 @@ class Progress:
             if now >= last + REFRESH or all_done:
                 self._shown = done, now
                 self.bar.set_postfix_str(f"{_clock(self.to_go())} to go", refresh=False)
-            self.bar.update(done - self.bar.n)
+            with contextlib.suppress(*GONE):
+                self.bar.update(done - self.bar.n)
         elif self.mode == "lines":
             due = done >= shown + LINE_EVERY or now >= last + SILENCE
             if due or tick.count == job.length:
                 self._shown = done, now
                 left = f", {_clock(self.to_go())} to go" * (not all_done)
                 line = f"{where} · {done:4.0%} · {_clock(now - self.began)}{left}"
-                print(line, file=sys.stderr, flush=True)
+                say(line)
 
     def to_go(self) -> float:
         """Seconds until the last job ends.
@@ -103,7 +107,8 @@ class Progress:
     def close(self) -> None:
         """Leave the terminal tidy."""
         if self.bar is not None:
-            self.bar.close()
+            with contextlib.suppress(*GONE):
+                self.bar.close()
 
 
 def _clock(seconds: float) -> str:

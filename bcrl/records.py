@@ -24,6 +24,7 @@ from bcrl.identity import Plain, differences, identity
 from bcrl.locks import waited_for
 
 SCHEMA = 2  # raised when a file's meaning changes
+MALFORMED = (ValueError, LookupError, TypeError, AttributeError)  # what a file may be
 LIBRARIES = ("hydra-core", "numpy", "numba", "scikit-learn", "torch")
 
 
@@ -41,7 +42,7 @@ def check_directory(plan: Plan) -> None:
     try:
         before = yaml.safe_load(present.read_text())
         changed = differences(before, plan.config)
-    except (yaml.YAMLError, AttributeError, OSError) as error:
+    except (yaml.YAMLError, OSError, *MALFORMED) as error:
         raise BcrlError(f"{present} can't be read ({error}); move it away") from error
     if changed:
         lines = [f"  {k}: there {a!r}, here {b!r}" for k, (a, b) in changed.items()]
@@ -98,10 +99,22 @@ def write_status(plan: Plan, seed: int, status: str, facts: Plain) -> None:
         "env": plan.env,
         "variant": plan.variant,
         "tag": plan.tag,
+        "asked": _ranges(plan.seeds),
         **facts,
         "config": config,
     }
     write_text(seed_path(plan.directory, seed, "json"), sealed(metadata))
+
+
+def _ranges(seeds: Sequence[int]) -> list[list[int]]:
+    """Seeds as [first, last] of each run of successive ones."""
+    ranges: list[list[int]] = []
+    for seed in sorted(seeds):
+        if ranges and seed == ranges[-1][1] + 1:
+            ranges[-1][1] = seed
+        else:
+            ranges.append([seed, seed])
+    return ranges
 
 
 def write_seed(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,6 +16,7 @@ from bcrl.compose import Plan
 from bcrl.envs import Env
 from bcrl.errors import BcrlError
 from bcrl.interrupts import Interrupted, Stop
+from bcrl.terminal import say
 from bcrl.workers import Died, each
 
 Seeds = tuple[int, ...]
@@ -58,7 +58,7 @@ def run(*plans: Plan) -> None:
         raise Interrupted
     if len(plans) > 1 and options["progress"] != "none":
         spent = time.perf_counter() - began
-        print(records.closing_table(plans, spent), file=sys.stderr)
+        say(records.closing_table(plans, spent))
     if failed:
         raise SeedsFailed(told(failed))
 
@@ -69,7 +69,9 @@ def merged(plans: Sequence[Plan]) -> Iterator[Plan]:
     for plan in plans:
         before = together.get(plan.directory, plan)
         seeds = tuple(dict.fromkeys(before.seeds + plan.seeds))
-        together[plan.directory] = replace(before, seeds=seeds)
+        commands = dict.fromkeys([*before.command.splitlines(), plan.command])
+        command = "\n".join(commands)
+        together[plan.directory] = replace(before, seeds=seeds, command=command)
     yield from together.values()
 
 
@@ -82,7 +84,14 @@ def ordered(plans: Sequence[Plan], failed: Failures) -> list[tuple[Plan, Seeds]]
     for plan in plans:
         over = failed.get(plan.directory, Failed(plan)).why
         left = [seed for seed in records.pending(plan) if seed not in over]
-        for team in checkpoints.teams(plan):
+        try:
+            teams = checkpoints.teams(plan) if left else []
+        except BcrlError as error:
+            failed[plan.directory] = Failed(
+                plan, over | dict.fromkeys(left, str(error))
+            )
+            continue
+        for team in teams:
             if set(team) & set(left):
                 work.append((plan, team))
                 left = [seed for seed in left if seed not in team]
@@ -107,7 +116,7 @@ def _look_round(plan: Plan) -> None:
     done = len(plan.seeds) - len(records.pending(plan))
     if done and plan.config["progress"] != "none":
         said = f"{done} of {len(plan.seeds)} seeds complete"
-        print(f"{plan.env} {plan.name}: {said}", file=sys.stderr)
+        say(f"{plan.env} {plan.name}: {said}")
 
 
 def _groups(seeds: list[int], lockstep: int, workers: int) -> list[Seeds]:
@@ -162,7 +171,9 @@ def _train(
         for number, outcome in _outcomes(jobs, workers, shown.tick, stop):
             plan, seeds = work[number]
             if isinstance(outcome, Died):
-                died = {} if stop.asked else dict.fromkeys(seeds, str(outcome))
+                done = records.is_complete
+                lost = [s for s in seeds if not done(plan.directory, s)]
+                died = dict.fromkeys([] if stop.asked else lost, str(outcome))
                 outcome = training.Outcome(died)
             if outcome.failed:
                 failed.setdefault(plan.directory, Failed(plan)).why |= outcome.failed
@@ -200,7 +211,7 @@ def _wait(busy: Sequence[tuple[Plan, Seeds]], mode: str, stop: Stop) -> None:
         directory, lock = seeds[0]
         held = f"{lock.name} in {directory} is computed by {lock.holder()}"
         more = f", and {len(seeds) - 1} more are" * (len(seeds) > 1)
-        print(f"waiting: {held}{more}", file=sys.stderr, flush=True)
+        say(f"waiting: {held}{more}")
     pause = 0.1
     while not stop.asked:
         for _, lock in seeds:
@@ -224,7 +235,8 @@ def told(failed: Failures) -> str:
             name = f"{lost.plan.env} {lost.plan.name}"
             lines.append(f"  {name}, {progress.named(seeds)}: {why}")
     lines.append(f"to run just {'these' if count > 1 else 'this'} again:")
-    lines += [f"  {lost.plan.command}" for lost in failed.values()]
+    for lost in failed.values():
+        lines += [f"  {command}" for command in lost.plan.command.splitlines()]
     return "\n".join(lines)
 
 

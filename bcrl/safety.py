@@ -37,7 +37,7 @@ LOGGING_KEYS = {
     | {"disable_existing_loggers", "incremental"},
     "formatters": {"format", "datefmt", "style", "validate", "class"},
     "handlers": {"class", "level", "formatter", "stream"}
-    | {"filename", "mode", "delay", "encoding"},
+    | {"filename", "mode", "delay"},
     "loggers": {"level", "handlers", "propagate"},
     "root": {"level", "handlers"},
 }
@@ -45,6 +45,11 @@ LOGGING_CLASSES = {
     "formatters": ("logging.Formatter", "colorlog.ColoredFormatter"),
     "handlers": ("logging.StreamHandler", "logging.FileHandler", "logging.NullHandler"),
 }
+#: Hydra's own; at any other place a line of a config's could be run by somebody.
+LOG_FILES = (
+    "${hydra.runtime.output_dir}/${hydra.job.name}.log",
+    "hydra-${hydra.job.name}.log",
+)
 STREAMS = ("ext://sys.stdout", "ext://sys.stderr")
 #: Interpolations that can only be text, wherever they lead.
 TEXTUAL = re.compile(
@@ -56,10 +61,7 @@ HARMLESS = re.compile(
     r"[A-Z]+_NUM_THREADS|OMP_(PROC_BIND|PLACES|DYNAMIC)|KMP_(AFFINITY|BLOCKTIME)"
     r"|CUDA_(VISIBLE_DEVICES|DEVICE_ORDER)|CUBLAS_WORKSPACE_CONFIG"
 )
-PATHS = (
-    *("runs_dir", "hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir"),
-    "hydra.output_subdir",
-)
+PATHS = (*("runs_dir", "hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir"),)
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{,99}")
 COMPONENT, PARTS = 200, 50  # bytes of a part of a path, and how many parts
 
@@ -86,6 +88,9 @@ def check(composed: DictConfig) -> None:
                 why = "only variables such as OMP_NUM_THREADS and CUDA_VISIBLE_DEVICES"
                 raise ConfigError(f"hydra.job.{key}", name, why)
     check_name("hydra.job.name", job.get("name", "bcrl"))
+    if hydra.get("output_subdir") not in (None, ".hydra"):
+        why = "only null or .hydra"
+        raise ConfigError("hydra.output_subdir", hydra["output_subdir"], why)
     verbose = hydra.get("verbose", False)
     if any(not isinstance(x, (bool, str)) for x in _parts(verbose)):
         raise ConfigError("hydra.verbose", verbose, "must be true or names of loggers")
@@ -191,8 +196,9 @@ def _check_logging(key: str, section: Any) -> None:
                     if each not in named[among]:
                         why = did_you_mean(str(each), named[among]) or f"no {among}"
                         raise ConfigError(f"{where}.{used}", each, why)
-            if "filename" in settings:
-                check_path(f"{where}.filename", str(settings["filename"]))
+            if settings.get("filename", LOG_FILES[0]) not in LOG_FILES:
+                why = f"only {' or '.join(LOG_FILES)}"
+                raise ConfigError(f"{where}.filename", settings["filename"], why)
 
 
 def _check_keys(key: str, section: object, allowed: set[str] | None) -> None:

@@ -7,10 +7,9 @@ import json
 import os
 import resource
 import socket
-import sys
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,6 +22,7 @@ from bcrl.locks import Lock, claimed
 from bcrl.probes import Probe
 from bcrl.progress import Tick, named
 from bcrl.stage import Course, Snapshot, Team
+from bcrl.terminal import say
 
 Seeds = tuple[int, ...]
 
@@ -53,9 +53,23 @@ class Session:
 
     rows: list[list[dict[str, Any]]]  # of each seed's CSV
     failed: dict[int, str] = field(default_factory=dict)  # by place in the group
-    wall: float = 0.0  # seconds, of all sessions
+    wall: float = 0.0  # seconds, with those before an interruption
     cpu: float = 0.0
     interruptions: int = 0
+
+
+class Clock:
+    """Adds the time that passes to a session's."""
+
+    def __init__(self, session: Session) -> None:
+        self.session, self._seen = session, (time.perf_counter(), time.process_time())
+
+    def note(self) -> None:
+        """What has passed since the last time."""
+        now = time.perf_counter(), time.process_time()
+        self.session.wall += now[0] - self._seen[0]
+        self.session.cpu += now[1] - self._seen[1]
+        self._seen = now
 
 
 def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> Outcome:
@@ -81,9 +95,9 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> Outcome:
             return Outcome(outcome.failed, busy, outcome.interrupted)
     except Exception as error:
         if not isinstance(error, BcrlError):  # unforeseen: show where it came from
-            traceback.print_exc()
+            say(traceback.format_exc())
         who = f"{plan.env} {plan.name}, {named(mine)}"
-        print(f"{who}: failed: {_reason(error)}", file=sys.stderr)
+        say(f"{who}: failed: {_reason(error)}")
         lost = [s for s in mine if not records.is_complete(directory, s)]
         return Outcome(dict.fromkeys(lost, _reason(error)))
 
@@ -113,29 +127,24 @@ def _train(
     stop: Stop,
 ) -> Outcome:
     """Train seeds whose locks are held, from their checkpoint if there is one."""
-    plan, began = job.plan, time.perf_counter()
-    cpu = time.process_time()
-    probe = probe_of(plan, seeds)
+    plan, probe = job.plan, probe_of(job.plan, seeds)
     team = Team(seeds, probe.states, job.threads, plan.device)
     course, session = Course(plan.stages, team), Session([[] for _ in seeds])
     if resumes:
         stored = checkpoints.load(plan, seeds, course.given)
-        course = Course(plan.stages, team, stored["past"])
+        course, probe.kept = Course(plan.stages, team, stored["past"]), stored["kept"]
         rest = stored["session"] | {"rows": json.loads(stored["session"]["rows"])}
-        session, probe.kept = Session(**rest), stored["kept"]
-    new = [s for s in seeds if not records.is_complete(plan.directory, s)]
+        session = Session(**rest)
+    clock = Clock(session)
     host = {"host": socket.gethostname(), "pid": os.getpid()}
+    new = [s for s in seeds if not records.is_complete(plan.directory, s)]
     for seed in new:
         records.write_status(plan, seed, "running", host)
-    before = session.wall, session.cpu
 
-    def save(interrupted: bool) -> None:
-        session.wall = before[0] + time.perf_counter() - began
-        session.cpu = before[1] + time.process_time() - cpu
-        rest = vars(session) | {
-            "interruptions": session.interruptions + interrupted,
-            "rows": json.dumps(session.rows),  # many small values, packed at once
-        }
+    def save() -> None:
+        clock.note()
+        # Rows are many small values, packed at once.
+        rest = vars(session) | {"rows": json.dumps(session.rows)}
         content = {"past": course.past, "session": rest, "kept": probe.kept}
         _check_locks(plan, held)
         checkpoints.save(plan, seeds, content, course.given)
@@ -145,37 +154,52 @@ def _train(
         ends = isinstance(now, Snapshot) and now.last_of_stage
         if isinstance(now, Snapshot):
             _look(probe, now, session)
-            spent = before[0] + time.perf_counter() - began
-            tick(Tick(job.number, now.stage.task, now.count, spent))
-        done = ends and now.count == plan.length
-        due = time.monotonic() - saved >= plan.config["checkpoint_every"]
-        if stop.asked and not done:
-            save(interrupted=True)
+            clock.note()
+            tick(Tick(job.number, now.stage.task, now.count, session.wall))
+        if ends and now.count == plan.length:
+            break
+        if stop.asked:
+            session.interruptions += 1
+            save()
             return Outcome(interrupted=True)
-        if (due or ends) and not done:
-            save(interrupted=False)
+        if ends or time.monotonic() - saved >= plan.config["checkpoint_every"]:
+            save()
             saved = time.monotonic()
+    clock.note()
+    failed = _record(job, seeds, new, probe, session, held)
+    checkpoints.remove(plan, seeds)
+    return Outcome(failed)
+
+
+def _record(
+    job: Job,
+    seeds: Seeds,
+    new: Sequence[int],
+    probe: Probe | StepProbe,
+    session: Session,
+    held: Mapping[int, Lock],
+) -> dict[int, str]:
+    """Write the files of the seeds that are `new`; those that diverged, and why."""
+    plan, failed = job.plan, {}
     facts = probe.facts() | {
-        "wall_seconds": before[0] + time.perf_counter() - began,
-        "cpu_seconds": (before[1] + time.process_time() - cpu) / len(seeds),  # a share
+        "wall_seconds": session.wall,
+        "cpu_seconds": session.cpu / len(seeds),  # this seed's share
         "interruptions": session.interruptions,
         "lockstep": list(seeds),
         "device": plan.device,
         "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
-    failed = {}
     for place, seed in enumerate(seeds):
         if seed not in new:
             continue
         why, status = session.failed.get(place), "complete"
         if why:
             failed[seed], status = why, f"failed: {why}"
-            print(f"{plan.env} {plan.name}: seed {seed} {status}", file=sys.stderr)
+            say(f"{plan.env} {plan.name}: seed {seed} {status}")
         _check_locks(plan, held)
-        arrays = probe.arrays(place)
-        rows = session.rows[place]
+        rows, arrays = session.rows[place], probe.arrays(place)
         records.write_seed(plan, seed, status, rows, arrays, facts | job.origin)
-    return Outcome(failed)
+    return failed
 
 
 def _look(probe: Probe | StepProbe, now: Snapshot, session: Session) -> None:

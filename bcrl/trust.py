@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import importlib.util
 import os
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -31,6 +33,21 @@ def module(key: str, name: str, where: str) -> ModuleType:
     except Exception as error:  # whatever its code does
         why = f"can't be imported: {type(error).__name__}: {error}"
         raise ConfigError(key, name, why) from error
+
+
+def sources() -> list[Path]:
+    """The Python files of what is trusted and can be found."""
+    found: list[Path] = []
+    for entry in filter(None, map(str.strip, os.environ.get(VARIABLE, "").split(","))):
+        try:
+            spec = importlib.util.find_spec(entry)
+        except (ImportError, ValueError):
+            continue
+        for folder in (spec and spec.submodule_search_locations) or ():
+            found += Path(folder).rglob("*.py")
+        if spec and spec.origin and not spec.submodule_search_locations:
+            found.append(Path(spec.origin))
+    return sorted(found)
 
 
 def attribute(key: str, name: str, dotted: str) -> Any:

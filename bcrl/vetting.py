@@ -38,21 +38,18 @@ RUNNING = (
 def plans(arguments: Namespace) -> list[Plan]:
     """The checked plan of each job that this command line asks for."""
     folders, jobs = _composed(arguments)
-    planned = [
-        replace(plan(job, job.hydra.runtime.choices, folders), command=_command(job))
-        for job in jobs
-    ]
+    planned = [plan(job, job.hydra, folders) for job in jobs]
     _refuse_collisions(planned)
     return planned
 
 
-def _command(job: DictConfig) -> str:
-    """The command that runs one job alone."""
-    asked = job.hydra.overrides
-    words = ["bcrl", *asked.task, *asked.hydra]
-    if job.hydra.job.config_name != CONFIG_NAME:
-        words += ["--config-name", job.hydra.job.config_name]
-    if job.hydra.runtime.choices.get("experiment"):
+def _command(hydra: DictConfig) -> str:
+    """The command that runs one job alone, from Hydra's part of its config."""
+    asked = [o for o in hydra.overrides.hydra if not o.startswith("hydra.mode=")]
+    words = ["bcrl", *hydra.overrides.task, *asked]
+    if hydra.job.config_name != CONFIG_NAME:
+        words += ["--config-name", hydra.job.config_name]
+    if hydra.runtime.choices.get("experiment"):
         words.append("hydra.mode=RUN")  # this job of its sweep, not all
     return shlex.join(words)
 
@@ -155,8 +152,9 @@ def _check_budgets(names: Iterable[object], folders: Folders) -> None:
             raise BcrlError(f"budget={name}: {did_you_mean(name, known)}")
 
 
-def plan(job: DictConfig, choices: Mapping[str, str], folders: Sequence[str]) -> Plan:
-    """The plan of one composed config, made with these group choices."""
+def plan(job: DictConfig, hydra: DictConfig, folders: Sequence[str]) -> Plan:
+    """The plan of one composed config, given Hydra's part of it."""
+    choices = hydra.runtime.choices
     for group in VARIANT_GROUPS:
         if choices.get(group) is None:
             raise BcrlError(f"{group}: every run needs a choice of it")
@@ -167,7 +165,8 @@ def plan(job: DictConfig, choices: Mapping[str, str], folders: Sequence[str]) ->
         known[tag] = _plain(composed(CONFIG_NAME, variant, extra))
         if not differences(config, known[tag]):
             break
-    return compose.plan(config, known, choices["env"])
+    made = compose.plan(config, known, choices["env"])
+    return replace(made, command=_command(hydra))
 
 
 def _usual(config: Plain, choices: Mapping[str, str], released: bool) -> Iterator[str]:

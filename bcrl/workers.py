@@ -8,7 +8,7 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from multiprocessing import connection
+from multiprocessing import connection, resource_tracker
 from typing import Any
 
 from bcrl.interrupts import SIGNALS, Stop
@@ -36,11 +36,13 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(do, theirs), daemon=True)
-        signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # until it can deal with them
+        resource_tracker.ensure_running()  # it would unblock what is blocked below
+        # Inherited: a worker hears no signal before it can deal with it.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         try:
             self.process.start()
         finally:
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()  # so that its end shows here
         self.job: int | None = None
 
@@ -83,7 +85,10 @@ def each(
                 except (EOFError, OSError):
                     worker.process.join()
                     job, worker.job = worker.job, None
-                    yield job, Died(worker.process.exitcode)
+                    if worker.process.exitcode:
+                        yield job, Died(worker.process.exitcode)
+                    elif not stop.asked:  # it was told to leave before it began
+                        waiting.insert(0, (job, jobs[job]))
                     if waiting:
                         team[place] = worker = _Worker(do)
                 else:

@@ -157,6 +157,24 @@ def test_a_worker_that_dies_fails_its_job_alone(tmp_path, calm):
     assert killing.compared(calm, p) is None
 
 
+def test_a_worker_that_alone_is_told_to_stop_is_replaced(tmp_path, calm):
+    process = start(tmp_path, "workers=2", "seeds.count=2")
+    os.kill(children(process.pid)[0], signal.SIGTERM)
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 0, said
+    p = plan(*LONG, "progress=none", f"runs_dir={tmp_path}")
+    assert killing.compared(calm, p) is None
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_nobody_reading_what_is_said_is_no_failure(tmp_path, calm, workers):
+    process = start(tmp_path, f"workers={workers}", "progress=lines")
+    process.stderr.close()
+    assert process.wait(timeout=120) in (0, 120)  # 120: Python can't flush its stream
+    p = plan(*LONG, "progress=none", f"runs_dir={tmp_path}")
+    assert killing.compared(calm, p) is None
+
+
 # --- what a checkpoint may be ---
 
 
@@ -215,6 +233,21 @@ def test_a_checkpoint_of_other_code_counts_as_absent(tmp_path, monkeypatch):
     other, _ = interrupted(tmp_path / "b")
     runner.run(other)
     assert killing.compared(p, other) is None  # and the old one is gone
+
+
+def test_a_checkpoint_of_other_code_of_the_users_counts_as_absent(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "mine.py").write_text("A = 1")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    codes = []
+    for trusted, text in (("", "A = 1"), ("mine", "A = 1"), ("mine", "A = 2")):
+        (tmp_path / "mine.py").write_text(text)
+        monkeypatch.setenv("BCRL_TRUST", trusted)
+        checkpoints._code.cache_clear()
+        codes.append(checkpoints._code())
+    checkpoints._code.cache_clear()
+    assert len(set(codes)) == 3
 
 
 def test_other_seeds_than_a_checkpoints_start_by_themselves(tmp_path):

@@ -176,6 +176,46 @@ def test_a_failing_job_leaves_the_others_alone_and_is_told_at_the_end(
     assert all(is_complete(bad.directory, seed) for seed in bad.seeds)
 
 
+def test_seeds_asked_for_in_parts_are_all_known(tmp_path):
+    parts = [
+        plan(
+            "env=maze",
+            "scale=smoke",
+            "progress=none",
+            f"seeds.first={first}",
+            "seeds.count=1",
+            f"runs_dir={tmp_path}",
+        )
+        for first in (0, 2)
+    ]
+    runner.run(*parts)
+    about = json.loads((parts[0].directory / "seed_0002.json").read_text())
+    assert about["asked"] == [[0, 0], [2, 2]]
+    (merged,) = runner.merged(parts)
+    assert merged.command.splitlines() == [part.command for part in parts]
+
+
+def test_a_failing_job_of_hydras_leaves_the_others_alone(bcrl, tmp_path):
+    sweep = ("env=linear_system", "algorithm=dqn", "variant=BC", "scale=smoke")
+    sweep += ("algorithm.learning_rate=1e30,1e-4", "seeds.count=1")
+    small = ("scale.max_steps=540", "algorithm.evaluation_episodes=3")
+    done = bcrl("-m", *sweep, *small, "+hydra.job.env_set.OMP_NUM_THREADS=1")
+    assert done.returncode == 1, done.stderr
+    assert "  bcrl env=linear_system" in done.stderr
+    assert len(list(tmp_path.glob("runs/smoke/linear_system/*/seed_0000.csv"))) == 2
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe", b"a: 1", b"- x", b"a: ["])
+def test_a_damaged_config_is_named(tmp_path, content):
+    p = plan("env=maze", "scale=smoke", "progress=none", f"runs_dir={tmp_path}")
+    p.directory.mkdir(parents=True)
+    (p.directory / "config.yaml").write_bytes(content)
+    with pytest.raises(
+        BcrlError, match=r"(?s)config.yaml can't be read .* move it away"
+    ):
+        runner.run(p)
+
+
 def test_an_unforeseen_error_shows_where_it_came_from(tmp_path, capsys, monkeypatch):
     p = broken(tmp_path, 1)
     monkeypatch.setattr(Broken, "fit", lambda *_: 1 / 0)

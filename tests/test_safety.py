@@ -123,6 +123,12 @@ BAD = {
     "a level": [LOG, "hydra.job_logging.root.level=LOUD"],
     "a handler that is none": [LOG, "hydra.job_logging.root.handlers=[nope]"],
     "a log elsewhere": [LOG, "hydra.job_logging.handlers.file.filename=../x.log"],
+    "a log where a shell reads": [
+        LOG,
+        "hydra.job_logging.handlers.file.filename=/tmp/.bashrc",
+    ],
+    "a log over our code": [LOG, "hydra.job_logging.handlers.file.filename=Makefile"],
+    "a config over ours": ["hydra.run.dir=.", "hydra.output_subdir=conf"],
     "a job's name": [LOG, "hydra.job.name=../x"],
     "a log's section": [LOG, "hydra.job_logging.handlers=${env}"],
     "a logger by reference": [LOG, "hydra.job_logging.handlers.file=${env.tasks}"],

@@ -275,7 +275,12 @@ def test_what_is_incomplete_is_named(folder, tmp_path, capsys, pattern, how, wha
 
 def test_more_seeds_asked_for_later_are_missing_until_made(folder, tmp_path, capsys):
     made = made_up_plan(tmp_path, "car_on_hill", "BC-FQI@mine", range(20)).config
-    reseal(folder / "seed_0003.json", config=made, command="bcrl seeds.count=20")
+    reseal(
+        folder / "seed_0003.json",
+        config=made,
+        asked=[[0, 19]],
+        command="bcrl seeds.count=20",
+    )
     code, lines = said(tmp_path, capsys)
     assert code == 1
     assert "lacks seeds 4–19, which had been asked for" in lines[0]

@@ -14,10 +14,10 @@ def algorithm(name: str) -> ModuleType:
     """The module of this package called `name`; ConfigError if there is none.
 
     It has `FAMILY` (how its runs are measured: "FQI" or "DQN"), `LOCKSTEP` (how many
-    seeds it likes to train together) and `stages(section, composition)`. A name with a
-    dot is a module of the user's own, as BCRL_TRUST allows.
+    seeds it likes to train together) and `stages(section, composition)`. Others are
+    modules of the user's own, as BCRL_TRUST allows.
     """
-    if isinstance(name, str) and "." in name:
+    if isinstance(name, str) and ("." in name or trust.is_trusted(name)):
         for needed in ("FAMILY", "LOCKSTEP", "stages"):
             trust.attribute("algorithm.name", name, f"{name}.{needed}")
         return trust.module("algorithm.name", name, name)

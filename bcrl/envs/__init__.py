@@ -21,9 +21,9 @@ def env_names() -> list[str]:
 def env_class(name: str) -> type:
     """The environment class called `name`; BcrlError if there is none.
 
-    A name with a dot is a module of the user's own, as BCRL_TRUST allows.
+    Others are modules of the user's own, as BCRL_TRUST allows.
     """
-    if "." in name:
+    if "." in name or trust.is_trusted(name):
         return trust.component("env.name", name, f"{name}.ENV")
     if name not in env_names():
         raise BcrlError(f"env.name={name}: {did_you_mean(name, env_names())}")

@@ -90,10 +90,9 @@ def status(document: Mapping[str, Any]) -> str:
     return document["status"].partition(":")[0]
 
 
-def asked(document: Mapping[str, Any]) -> range:
+def asked(document: Mapping[str, Any]) -> set[int]:
     """The seeds that were asked for when this one was made."""
-    seeds = document["config"]["seeds"]
-    return range(seeds["first"], seeds["first"] + seeds["count"])
+    return {seed for a, b in document["asked"] for seed in range(a, b + 1)}
 
 
 def _bytes(path: Path) -> bytes:
