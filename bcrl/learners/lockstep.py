@@ -22,10 +22,6 @@ from bcrl.transfer import Learned, PolicyReuse, ResidualPolicy, Start
 if TYPE_CHECKING:
     from bcrl.learners.dqn import DQN
 
-CHANGING = (
-    *("step", "deep", "replay", "ahead", "state", "steps_in_episode", "decisions"),
-    *("loss", "updates"),
-)
 BLOCK = 500  # steps whose uniforms are drawn at a time, from a stream of their own
 
 
@@ -42,8 +38,9 @@ class Lockstep:
     ) -> None:
         self.settings, self.stage, self.start, self.team = settings, stage, start, team
         self.env = stage.env
-        for name, value in (saved or self._fresh()).items():
-            setattr(self, name, value)
+        changing = saved or self._fresh()
+        vars(self).update(changing)
+        self._changing = tuple(changing)
         self._gradient_step = updater(self.deep, self.replay)
         self.table = (
             combined(self.env.actions)
@@ -76,7 +73,7 @@ class Lockstep:
 
     def saved(self) -> dict[str, Any]:
         """What `_fresh` names, as it is now: enough to go on exactly."""
-        return {name: getattr(self, name) for name in CHANGING}
+        return {name: getattr(self, name) for name in self._changing}
 
     def _networks(self) -> DeepQ:
         """Those of the previous stage, or new ones with the target equal to online."""
