@@ -72,10 +72,9 @@ def remove_half_written(folder: Path, start: str) -> None:
         left.unlink(missing_ok=True)
 
 
-def sha256(path: Path) -> str:
+def sha256(data: bytes) -> str:
     """The SHA-256 of a file's bytes, hexadecimal."""
-    with open(path, "rb") as handle:
-        return hashlib.file_digest(handle, "sha256").hexdigest()
+    return hashlib.sha256(data).hexdigest()
 
 
 def sealed(document: dict[str, Any]) -> str:
@@ -92,4 +91,4 @@ def is_intact(document: dict[str, Any]) -> bool:
 
 def _digest(document: dict[str, Any]) -> str:
     text = json.dumps(document, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
+    return sha256(text.encode())

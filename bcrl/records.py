@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import platform
@@ -76,11 +77,8 @@ def seed_path(directory: Path, seed: int, suffix: str) -> Path:
 
 def is_complete(directory: Path, seed: int) -> bool:
     """Whether this seed's metadata, written last, says that all of it is there."""
-    try:
-        metadata = json.loads(seed_path(directory, seed, "json").read_text())
-        complete = (metadata["status"], metadata["schema"]) == ("complete", SCHEMA)
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
+    facts = _facts(directory, seed)
+    complete = (facts.get("status"), facts.get("schema")) == ("complete", SCHEMA)
     files = [seed_path(directory, seed, suffix) for suffix in ("csv", "npz")]
     return complete and all(file.exists() for file in files)
 
@@ -129,11 +127,14 @@ def write_seed(
     lines = [",".join(rows[0])]
     lines += [",".join(repr(value) for value in row.values()) for row in rows]
     text = "\n".join(lines) + "\n"
-    csv, npz = (seed_path(plan.directory, seed, suffix) for suffix in ("csv", "npz"))
-    write_atomically(npz, lambda file: np.savez(file, **dict(arrays)))
-    write_text(csv, text)
-    hashes = {"sha256": {"csv": sha256(csv), "npz": sha256(npz)}}
-    write_status(plan, seed, status, hashes | facts)
+    packed = io.BytesIO()
+    np.savez(packed, **dict(arrays))
+    contents = {"npz": packed.getvalue(), "csv": text.encode()}
+    for suffix, data in contents.items():
+        path = seed_path(plan.directory, seed, suffix)
+        write_atomically(path, lambda file, data=data: file.write(data))
+    hashes = {suffix: sha256(data) for suffix, data in contents.items()}
+    write_status(plan, seed, status, {"sha256": hashes} | facts)
 
 
 def closing_table(plans: Sequence[Plan], seconds: float) -> str:
@@ -144,7 +145,7 @@ def closing_table(plans: Sequence[Plan], seconds: float) -> str:
     head = f"{'':32}{'seeds':>7}{'failed':>8}{'CPU s a seed':>14}{'core min':>10}"
     lines, total, peak = [head], 0.0, 0.0
     for plan in plans:
-        facts = [_facts(plan, seed) for seed in plan.seeds]
+        facts = [_facts(plan.directory, seed) for seed in plan.seeds]
         spent = [fact["cpu_seconds"] for fact in facts if "cpu_seconds" in fact]
         failed = sum(fact.get("status") != "complete" for fact in facts)
         total += sum(spent)
@@ -162,12 +163,13 @@ def closing_table(plans: Sequence[Plan], seconds: float) -> str:
     return "\n".join(lines)
 
 
-def _facts(plan: Plan, seed: int) -> Plain:
+def _facts(directory: Path, seed: int) -> Plain:
     """A seed's metadata, nothing if it has none."""
     try:
-        return json.loads(seed_path(plan.directory, seed, "json").read_text())
+        facts = json.loads(seed_path(directory, seed, "json").read_text())
     except (OSError, ValueError):
         return {}
+    return facts if isinstance(facts, dict) else {}
 
 
 def provenance() -> dict[str, Any]:

@@ -203,18 +203,16 @@ def _outcomes(
 def _wait(busy: Sequence[tuple[Plan, Seeds]], mode: str, stop: Stop) -> None:
     """Until one of the seeds that other processes compute is free, or complete."""
     seeds = [
-        (plan.directory, locks.seed_lock(plan.directory, seed))
-        for plan, group in busy
-        for seed in group
+        locks.seed_lock(plan.directory, seed) for plan, group in busy for seed in group
     ]
     if mode != "none":
-        directory, lock = seeds[0]
-        held = f"{lock.name} in {directory} is computed by {lock.holder()}"
+        lock = seeds[0]
+        held = f"{lock.name} in {lock.folder} is computed by {lock.holder()}"
         more = f", and {len(seeds) - 1} more are" * (len(seeds) > 1)
         say(f"waiting: {held}{more}")
     pause = 0.1
     while not stop.asked:
-        for _, lock in seeds:
+        for lock in seeds:
             if lock.acquire():
                 lock.release()
                 return

@@ -61,7 +61,7 @@ HARMLESS = re.compile(
     r"[A-Z]+_NUM_THREADS|OMP_(PROC_BIND|PLACES|DYNAMIC)|KMP_(AFFINITY|BLOCKTIME)"
     r"|CUDA_(VISIBLE_DEVICES|DEVICE_ORDER)|CUBLAS_WORKSPACE_CONFIG"
 )
-PATHS = (*("runs_dir", "hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir"),)
+PATHS = ("runs_dir", "hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{,99}")
 COMPONENT, PARTS = 200, 50  # bytes of a part of a path, and how many parts
 

@@ -119,14 +119,12 @@ class Course:
         self._now: Pause | None = None
 
     def __iter__(self) -> Iterator[Pause]:
-        done, learned, state = self._past.stages, self._past.learned, self._past.state
-        for stage in self.stages[done:]:
-            start = begin(stage.transfers, learned)
+        for stage in self.stages[self._past.stages :]:
+            start, state = begin(stage.transfers, self._past.learned), self._past.state
             for now in stage.learner.learn(stage, start, self.team, state):
                 self._now = now
                 yield now
-            learned, state, done = now.learned, None, done + 1
-            self._past = Past(done, learned)
+            self._past = Past(stage.number, now.learned)
 
     @property
     def past(self) -> Past:

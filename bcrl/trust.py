@@ -17,8 +17,13 @@ VARIABLE = "BCRL_TRUST"  # of the process's environment; no config can set it
 
 def is_trusted(name: str) -> bool:
     """Whether `name` is a module that BCRL_TRUST lists, or lies below one."""
-    listed = [entry.strip() for entry in os.environ.get(VARIABLE, "").split(",")]
-    return any(entry and f"{name}.".startswith(f"{entry}.") for entry in listed)
+    return any(f"{name}.".startswith(f"{entry}.") for entry in _listed())
+
+
+def _listed() -> list[str]:
+    """What BCRL_TRUST names."""
+    entries = os.environ.get(VARIABLE, "").split(",")
+    return [entry.strip() for entry in entries if entry.strip()]
 
 
 def module(key: str, name: str, where: str) -> ModuleType:
@@ -38,7 +43,7 @@ def module(key: str, name: str, where: str) -> ModuleType:
 def sources() -> list[Path]:
     """The Python files of what is trusted and can be found."""
     found: list[Path] = []
-    for entry in filter(None, map(str.strip, os.environ.get(VARIABLE, "").split(","))):
+    for entry in _listed():
         try:
             spec = importlib.util.find_spec(entry)
         except (ImportError, ValueError):

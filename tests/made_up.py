@@ -75,7 +75,7 @@ def rerecord(path: Path, content: bytes | str) -> None:
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     about = path.with_suffix(".json")
     hashes = json.loads(about.read_text())["sha256"]
-    reseal(about, sha256=hashes | {path.suffix[1:]: files.sha256(path)})
+    reseal(about, sha256=hashes | {path.suffix[1:]: files.sha256(path.read_bytes())})
 
 
 def edit_csv(path: Path, edit: Callable[[pd.DataFrame], pd.DataFrame]) -> None:

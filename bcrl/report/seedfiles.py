@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import zipfile
@@ -14,7 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bcrl.files import is_intact
+from bcrl.files import is_intact, sha256
 from bcrl.report.findings import AGAIN, unreadable
 
 SCHEMA = 2  # of the records that this report reads
@@ -108,7 +107,7 @@ def _bytes(path: Path) -> bytes:
 def recorded(path: Path, document: Mapping[str, Any]) -> bytes:
     """A file's bytes; Refused unless their hash is the one in the seed's JSON."""
     data = _bytes(path)
-    if hashlib.sha256(data).hexdigest() != document["sha256"][path.suffix[1:]]:
+    if sha256(data) != document["sha256"][path.suffix[1:]]:
         raise unreadable(path, f"is not what {path.stem}.json has the SHA-256 of")
     return data
 
