@@ -61,6 +61,9 @@ def composition(config: Plain, tasks: list[Env]) -> Composition:
     if isinstance(transfer, (PolicyReuse, ResidualPolicy)) and not curriculum:
         why = "needs an earlier task whose policy helps: curriculum=on"
         raise ConfigError("transfer", config["transfer"]["name"], why)
+    if isinstance(transfer, ResidualPolicy) and tasks[-1].actions is None:
+        why = "combines actions as vectors, which env.action_vectors has to name"
+        raise ConfigError("transfer", "residual_policy", why)
     if isinstance(transfer, ResidualPolicy) and boost:
         why = (
             "its Q is about its own actions, not the executed ones that a base is "

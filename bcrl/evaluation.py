@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bcrl.envs import Env
 from bcrl.probes import probed_states, scene
-from bcrl.rollout import CHOICES, play, start_states
+from bcrl.rollout import CHOICES, play, start_states, success_of
 from bcrl.stage import Moment
 from bcrl.streams import stream
 
@@ -35,7 +35,7 @@ def evaluate(now: Moment, seeds: Sequence[int]) -> list[dict[str, float]]:
     outcomes = {
         "return": played.reward.sum(-1),
         "discounted_return": played.discounted_return(env.gamma),
-        "success_rate": played.solved(),
+        "success_rate": played.solved(success_of(env)),
     }
     best = np.asarray(now.learned.q(start, env.n_actions)).max(-1)
     return [

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl import oracle
-from bcrl.envs import Env
+from bcrl.envs import Env, is_simulated
 from bcrl.errors import BcrlError, ConfigError, did_you_mean
 from bcrl.learners.fqi import Iteration
 from bcrl.q import Values
-from bcrl.rollout import draws, rollout
+from bcrl.rollout import draws, evaluation_starts, rollout, success_of
 from bcrl.streams import stream
 
 
@@ -108,16 +108,12 @@ class Probe:
     def measure(self, snapshot: Iteration) -> list[dict[str, float]]:
         """Each seed's metrics."""
         env = snapshot.stage.env
-        start = env.evaluation_states()
-        u = np.stack(
-            [
-                draws(stream(seed, "evaluation", snapshot.count), env, len(start))
-                for seed in self.seeds
-            ]
-        )
-        everyone = np.broadcast_to(start, (len(self.seeds), *start.shape))
-        episodes = rollout(env, snapshot.learned.q, everyone, u)
-        returns, solved = episodes.discounted_return(env.gamma), episodes.solved()
+        rngs = [stream(seed, "evaluation", snapshot.count) for seed in self.seeds]
+        start = np.stack([evaluation_starts(rng, env) for rng in rngs])
+        u = np.stack([draws(rng, env, start.shape[1]) for rng in rngs])
+        episodes = rollout(env, snapshot.learned.q, start, u)
+        returns = episodes.discounted_return(env.gamma)
+        solved = episodes.solved(success_of(env))
         start_rows, rows, q_star = _layout(env, self.target)
         views = (
             View(
@@ -184,7 +180,8 @@ def _layout(env: Env, target: Env) -> tuple[NDArray, NDArray, NDArray]:
         return match.argmax(1)
 
     known = oracle.reference(env)
-    start = rows(env.evaluation_states())
+    # A simulator starts where it likes: Q is looked at where the target may start.
+    start = rows((target if is_simulated(env) else env).evaluation_states())
     if known is None:
         return start, np.empty(0, np.intp), np.empty((0, env.n_actions))
     return start, rows(known.states), known.q

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.envs import Env, is_finite
+from bcrl.envs import Env, is_finite, is_simulated, lanes_of
 from bcrl.policies import greedy, uniform
 from bcrl.q import Q, Table
 
@@ -32,10 +32,18 @@ class Episodes:
         steps = np.arange(self.reward.shape[-1])
         return (self.reward * gamma**steps).sum(-1)
 
-    def solved(self) -> NDArray[np.bool_]:
-        """Whether each episode was absorbed without a punishment, shape (S, E)."""
+    def solved(self, success: str = "unpunished") -> NDArray[np.bool_]:
+        """Whether each episode was a success, shape (S, E).
+
+        That is to be absorbed, `unpunished` or however (`absorbed`), or to have lasted
+        to the horizon (`survived`).
+        """
         last = np.maximum(self.length - 1, 0)[..., None]
         ended = np.take_along_axis(self.absorbing, last, -1)[..., 0]
+        if success == "survived":
+            return ~ended & (self.length == self.reward.shape[-1])
+        if success == "absorbed":
+            return ended
         return ended & (np.take_along_axis(self.reward, last, -1)[..., 0] >= 0.0)
 
 
@@ -51,8 +59,19 @@ def draws(rng: np.random.Generator, env: Env, episodes: int) -> NDArray[np.float
 def start_states(
     rng: np.random.Generator, env: Env, episodes: int
 ) -> NDArray[np.float64]:
-    """Start states of one seed's episodes, shape (E, d)."""
+    """Where one seed's episodes start, as `env.initial` says, shape (E, d)."""
     return env.initial(rng.random((episodes, env.initial_noise)))
+
+
+def evaluation_starts(rng: np.random.Generator, env: Env) -> NDArray[np.float64]:
+    """Where FQI's greedy policy is evaluated from: set states, or random ones."""
+    states = env.evaluation_states()
+    return start_states(rng, env, len(states)) if is_simulated(env) else states
+
+
+def success_of(env: Env) -> str:
+    """What `Episodes.solved` takes for a success in `env`."""
+    return getattr(env, "success", "unpunished")
 
 
 #: Actions (S, E) at states (S, E, d), from uniforms (S, E, 2 or more); only the lanes
@@ -87,11 +106,13 @@ def play(
     env: Env, policy: Policy, start: NDArray[np.float64], u: NDArray[np.float64]
 ) -> Episodes:
     """Episodes from start (S, E, d); the last of u (S, T, E, …) are the env's noise."""
-    n_seeds, n_episodes, d = start.shape
+    n_seeds, n_episodes, _ = start.shape
     horizon, noise = u.shape[1], u.shape[-1] - env.step_noise
     lanes_of_a_step = (horizon, n_seeds, n_episodes)  # what is written at once is close
-    state = np.zeros((horizon + 1, n_seeds, n_episodes, d))
-    state[0] = start
+    running = lanes_of(env)
+    first = running.begin(start)
+    state = np.zeros((horizon + 1, *first.shape))
+    state[0] = first
     action = None
     reward = np.zeros(lanes_of_a_step)
     absorbing = np.zeros(lanes_of_a_step, bool)
@@ -102,16 +123,17 @@ def play(
         act = policy(now, u[:, t], alive)
         if action is None:
             action = np.zeros((*lanes_of_a_step, *act.shape[2:]), act.dtype)
-            step = env.push if act.dtype == np.float64 else env.step
         # Boolean masks copy; as long as all lanes live there is no need of one.
         lanes = (slice(None), slice(None)) if alive.all() else (alive,)
         length[lanes] += 1
         action[t] = act
-        after, r, done = step(now[lanes], act[lanes], u[:, t, :, noise:][lanes])
+        after, r, done, cut = running.step(
+            now[lanes], act[lanes], u[:, t, :, noise:][lanes], lanes
+        )
         state[t + 1] = now
         state[t + 1][lanes] = after
         reward[t][lanes], absorbing[t][lanes] = r, done
-        alive[lanes] = ~done
+        alive[lanes] = ~(done | cut)
         if not alive.any():
             break
     parts = (state, action, reward, absorbing)

@@ -11,13 +11,9 @@ from bcrl import pack
 from bcrl.errors import BcrlError
 from bcrl.q import ZERO, Sum
 from bcrl.q.quadratic import Quadratic
-from bcrl.q.regressors import (
-    Fits,
-    Fitted,
-    ForestRegressor,
-    Problem,
-    SklearnForestRegressor,
-)
+from bcrl.q.regression import Fits, Fitted, Problem
+from bcrl.q.regressors import ForestRegressor
+from bcrl.q.scikit import SklearnForest
 from bcrl.stage import Past, Team
 
 
@@ -72,7 +68,7 @@ def test_one_object_stays_one_and_what_is_given_is_not_stored(tmp_path):
     assert torch.equal(tensor, torch.arange(3.0))
 
 
-@pytest.mark.parametrize("kind", [ForestRegressor, SklearnForestRegressor])
+@pytest.mark.parametrize("kind", [ForestRegressor, SklearnForest])
 def test_a_model_is_stored_as_its_problem_and_fitted_again(tmp_path, kind):
     rng, regressor = np.random.default_rng(0), kind(trees=3)
     x, y = rng.random((200, 2)).astype(np.float32), rng.random(200)

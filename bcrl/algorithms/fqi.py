@@ -11,7 +11,8 @@ from bcrl.envs import Env, is_finite
 from bcrl.errors import ConfigError
 from bcrl.identity import Plain
 from bcrl.learners.fqi import FQI
-from bcrl.q.regressors import Regressor, regressor_class
+from bcrl.q.regression import Regressor
+from bcrl.q.regressors import regressor_class
 from bcrl.stage import Stage
 from bcrl.transfer import Boost, PolicyReuse, ResidualPolicy, Shape
 

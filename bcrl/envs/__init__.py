@@ -6,10 +6,18 @@ import importlib
 import pkgutil
 
 from bcrl import trust
-from bcrl.envs.base import Env, FiniteEnv, is_finite
+from bcrl.envs.base import Env, FiniteEnv, is_finite, is_simulated, lanes_of
 from bcrl.errors import BcrlError, did_you_mean
 
-__all__ = ["Env", "FiniteEnv", "env_class", "env_names", "is_finite"]
+__all__ = [
+    "Env",
+    "FiniteEnv",
+    "env_class",
+    "env_names",
+    "is_finite",
+    "is_simulated",
+    "lanes_of",
+]
 
 
 def env_names() -> list[str]:

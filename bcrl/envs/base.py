@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Protocol
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.errors import ConfigError
+from bcrl.pack import storable
 
 Step = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]
 
@@ -69,6 +71,83 @@ class FiniteEnv(Env, Protocol):
 
     def index(self, state: NDArray[np.float64]) -> NDArray[np.intp]:
         """Row of each state (..., d) in `states()`."""
+
+
+class Lanes(Protocol):
+    """Episodes of one env side by side, one a lane, in arrays of any leading axes."""
+
+    def begin(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The states (…, d) of lanes that start as `initial` says."""
+
+    def step(
+        self,
+        state: NDArray[np.float64],
+        action: NDArray,
+        noise: NDArray[np.float64],
+        lanes: Any = ...,
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray | bool]:
+        """A step of the lanes chosen: as `Env.step`, and where an episode is cut."""
+
+    def restart(
+        self,
+        over: NDArray[np.bool_],
+        start: NDArray[np.float64],
+        state: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """All states, anew from `start` in the lanes that are over."""
+
+
+class SimulatedEnv(Env, Protocol):
+    """An env that keeps its state to itself: only whole episodes can be had of it.
+
+    `initial` gives what a lane is reset by, `state`s are observations, and noise is the
+    simulator's own, from the reset on.
+    """
+
+    def lanes(self) -> Lanes:
+        """Simulators to be stepped side by side."""
+
+
+@storable
+@dataclass(frozen=True)
+class PureLanes:
+    """Lanes of an env whose steps are pure functions: the caller has the states."""
+
+    env: Env
+
+    def begin(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The start states themselves."""
+        return start
+
+    def step(
+        self,
+        state: NDArray[np.float64],
+        action: NDArray,
+        noise: NDArray[np.float64],
+        lanes: Any = ...,
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray | bool]:
+        """`step`, or `push` if the actions are forces; never cut."""
+        step = self.env.push if action.dtype == np.float64 else self.env.step
+        return *step(state, action, noise), False
+
+    def restart(
+        self,
+        over: NDArray[np.bool_],
+        start: NDArray[np.float64],
+        state: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """The start states where it is over."""
+        return np.where(over[..., None], start, state)
+
+
+def is_simulated(env: Env) -> bool:
+    """Whether `env` is a SimulatedEnv."""
+    return hasattr(env, "lanes")
+
+
+def lanes_of(env: Env) -> Lanes:
+    """Lanes in which episodes of `env` can run side by side."""
+    return env.lanes() if is_simulated(env) else PureLanes(env)
 
 
 def check_episodes(gamma: float, horizon: int) -> None:

@@ -11,9 +11,9 @@ import numpy as np
 
 from bcrl import data, rollout
 from bcrl.bellman import residual_target, shaping
-from bcrl.envs import is_finite
+from bcrl.envs import is_finite, is_simulated
 from bcrl.q import ZERO, Table, Values
-from bcrl.q.regressors import Fits, Fitted, Problem, Regressor
+from bcrl.q.regression import Fits, Fitted, Problem, Regressor
 from bcrl.stage import Snapshot, Stage, Team
 from bcrl.streams import stream
 from bcrl.transfer import Learned, Start
@@ -72,7 +72,8 @@ class FQI:
             else [[None] * env.n_actions for _ in sets]
         )
         # With noise no state comes twice; the next stage's base should not remember.
-        evaluated = start if env.step_noise else start.remembered()
+        noisy = env.step_noise or is_simulated(env)
+        evaluated = start if noisy else start.remembered()
         for k in range(done + 1, self.iterations + 1):
             residual = [values.copy() for values in residual]
             problems = self._problems(stage, k, team, rewards, sets, base, residual)

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from bcrl.bellman import frozen_part, shaping
+from bcrl.envs import lanes_of
 from bcrl.learners.update import updater
 from bcrl.policies import combined, epsilon_greedy, greedy
 from bcrl.q import Q
@@ -59,12 +60,14 @@ class Lockstep:
             [stream(s, "exploration", number).random(env.initial_noise) for s in seeds]
         )
         shape = (n, self.settings.replay_size, env.state_dim, env.n_actions)
+        lanes = lanes_of(env)
         return {
             "step": 0,  # steps done
             "deep": self._networks(),
             "replay": Replay.empty(*shape, self.team.device),
             "ahead": None,  # ϱ's values at the state, if known
-            "state": env.initial(begin),  # (S, d)
+            "lanes": lanes,
+            "state": lanes.begin(env.initial(begin)),  # (S, d)
             "steps_in_episode": np.zeros(n, np.intp),
             "decisions": np.zeros(n, np.intp),  # not random ones, for RPL's offset
             "loss": np.zeros(n),  # summed over the updates since the last moment
@@ -114,7 +117,7 @@ class Lockstep:
         if self.table is not None:
             self.decisions += u[:, 0] >= epsilon
         noise = u[:, CHOICES : CHOICES + env.step_noise]
-        after, reward, absorbing = env.step(self.state, action, noise)
+        after, reward, absorbing, cut = self.lanes.step(self.state, action, noise)
         known = self._known(after)
         if start.shape is not None:
             reward = reward + self._shaping(action, noise, after, absorbing, known)
@@ -130,10 +133,10 @@ class Lockstep:
         )
         self.replay.add(self.state, after, next_base, fixed, discount, own)
         self.steps_in_episode += 1
-        over = absorbing | (self.steps_in_episode == env.horizon)
+        over = absorbing | cut | (self.steps_in_episode == env.horizon)
         if over.any():
             fresh = env.initial(u[:, CHOICES + env.step_noise :])
-            after = np.where(over[:, None], fresh, after)
+            after = self.lanes.restart(over, fresh, after)
             self.steps_in_episode[over] = 0
             known = self._known(after)
         self.state, self.known = after, known

@@ -1,0 +1,214 @@
+"""Any Gymnasium environment with Box observations and Discrete actions."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from bcrl import trust
+from bcrl.envs import _simulators as simulators
+from bcrl.envs.base import check_episodes
+from bcrl.errors import BcrlError, ConfigError, at_least, did_you_mean
+
+SUCCESS = ("absorbed", "survived", "unpunished")
+TRIES = 5  # episodes in which two tasks have to differ
+
+
+@dataclass(frozen=True)
+class Gymnasium:
+    """A task of `gymnasium.make(id, **kwargs)`, changed by attributes and wrappers.
+
+    | | |
+    |---|---|
+    | observation | the Box, flattened; or what `observation`, a function `module.name` that is trusted, makes of an observation |
+    | actions | the Discrete space's, counted from 0 |
+    | dynamics | the environment's own; its randomness follows from the seed of each reset |
+    | absorbing | terminated; truncated by a wrapper is cut, as at the horizon |
+    | horizon | `horizon` steps, else the registered `max_episode_steps` |
+    | success | `absorbed`: the episode ended by itself; `survived`: it lasted to the horizon; `unpunished`: it ended with a reward of 0 or more |
+
+    Tasks differ in `kwargs` of the constructor, in `attributes` set on the unwrapped
+    environment, in `wrappers` ({name: …, arguments}) or in any other field.
+    `starts` episodes measure each FQI iteration. `action_vectors` (A, k) say what each
+    action does, which residual policies want to know. `verify=False` allows tasks that
+    random play can't tell apart. Raises ConfigError for whatever of it can't be.
+    """  # noqa: E501
+
+    id: str
+    kwargs: dict = field(default_factory=dict)
+    attributes: dict = field(default_factory=dict)
+    wrappers: list = field(default_factory=list)
+    observation: Any = None
+    gamma: float = 0.99
+    horizon: Any = None
+    success: str = "absorbed"
+    starts: int = 20
+    action_vectors: Any = None
+    verify: bool = True
+
+    name: ClassVar[str] = "gymnasium"
+    initial_noise: ClassVar[int] = 1  # the seed of a reset
+    step_noise: ClassVar[int] = 0
+
+    def __post_init__(self) -> None:
+        if self.success not in SUCCESS:
+            why = did_you_mean(str(self.success), SUCCESS)
+            raise ConfigError("env.success", self.success, why)
+        at_least("env.starts", self.starts, 1)
+        horizon = self.horizon or simulators.max_steps(self.id)
+        if type(horizon) is not int:
+            why = f"is needed: {self.id} has no limit of its own (a number of steps)"
+            raise ConfigError("env.horizon", self.horizon, why)
+        object.__setattr__(self, "horizon", horizon)
+        check_episodes(self.gamma, horizon)
+        space = self._simulator.action_space
+        if not isinstance(space, spaces.Discrete):
+            why = f"has actions {space}, only Discrete ones can be learned"
+            raise ConfigError("env.id", self.id, why)
+        seen = self._simulator.observation_space
+        if self.observation is None and not isinstance(seen, spaces.Box):
+            why = f"has observations {seen}, only a Box can be learned from; "
+            why += "env.observation=module.function makes an array of them"
+            raise ConfigError("env.id", self.id, why)
+        if self.action_vectors is not None:
+            self._check_vectors()
+
+    def _check_vectors(self) -> None:
+        try:
+            fits = np.array(self.action_vectors, float).shape[:1] == (self.n_actions,)
+        except (TypeError, ValueError):
+            fits = False
+        if not fits:
+            why = f"must be {self.n_actions} vectors of one length, one an action"
+            raise ConfigError("env.action_vectors", self.action_vectors, why)
+
+    def __hash__(self) -> int:
+        return hash(json.dumps(vars(self), sort_keys=True, default=str))
+
+    def __reduce__(self) -> tuple:
+        return _made, ({f: getattr(self, f) for f in self.__dataclass_fields__},)
+
+    @property
+    def actions(self) -> NDArray[np.float64] | None:
+        """`action_vectors` as an array (A, k)."""
+        vectors = self.action_vectors
+        return None if vectors is None else np.array(vectors, np.float64)
+
+    @property
+    def n_actions(self) -> int:
+        """Actions, 0 … n − 1."""
+        return int(self._simulator.action_space.n)
+
+    @functools.cached_property
+    def state_dim(self) -> int:
+        """Entries of an observation."""
+        return len(self.observed(self._simulator.reset(seed=0)[0]))
+
+    @property
+    def _simulator(self) -> gymnasium.Env:
+        return _first(self)
+
+    def simulator(self) -> gymnasium.Env:
+        """A new environment of this task, without a time limit."""
+        return simulators.made(self.id, self.kwargs, self.attributes, self.wrappers)
+
+    def observed(self, observation: Any) -> NDArray[np.float64]:
+        """An observation as a vector (d,)."""
+        if self.observation is not None:
+            observation = self._map(observation)
+        return np.asarray(observation, np.float64).reshape(-1)
+
+    @functools.cached_property
+    def _map(self) -> Any:
+        name = str(self.observation)
+        return trust.attribute("env.observation", name, name)
+
+    def initial(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What lanes are reset by: the noise (…, 1) itself."""
+        return noise
+
+    def lanes(self) -> simulators.SimulatedLanes:
+        """Simulators side by side."""
+        return simulators.SimulatedLanes(self)
+
+    def evaluation_states(self) -> NDArray[np.float64]:
+        """Observations after `starts` resets, always the same ones, (starts, d)."""
+        numbers = (np.arange(self.starts) + 0.5) / self.starts
+        return self.lanes().begin(numbers[:, None])
+
+    @staticmethod
+    def check_tasks(tasks: Sequence[Gymnasium]) -> None:
+        """Raise ConfigError for tasks that can't follow each other, or are the same."""
+        target = tasks[-1]
+        for number, task in enumerate(tasks[:-1], start=1):
+            for what in ("state_dim", "n_actions"):
+                here, there = getattr(task, what), getattr(target, what)
+                if here != there:
+                    why = f"task {number} has {what} {here}, the target {there}; "
+                    why += "a function env.observation can make them equal"
+                    raise ConfigError("env.tasks", what, why)
+            after = tasks[number]
+            if task != after and target.verify and not differ(task, after):
+                why = f"tasks {number} and {number + 1} behave alike in {TRIES} "
+                why += "episodes of random play, so what differs may not be applied "
+                why += "(env.verify=false if that is as it should be)"
+                raise ConfigError("env.tasks", _difference(task, after), why)
+
+
+def differ(one: Gymnasium, other: Gymnasium) -> bool:
+    """Whether two tasks lead anywhere else under the same resets and actions."""
+    if one.horizon != other.horizon or one.gamma != other.gamma:
+        return True
+    start = (np.arange(TRIES)[:, None] + 0.5) / TRIES
+    actions = np.random.default_rng(0).integers(
+        one.n_actions, size=(one.horizon, TRIES)
+    )
+    pair = [task.lanes() for task in (one, other)]
+    begun = [lanes.begin(start) for lanes in pair]
+    if not np.array_equal(*begun):
+        return True
+    alive = np.ones(TRIES, bool)
+    for action in actions:
+        (*a, cut), (*b, _) = (x.step(None, action[alive], None, alive) for x in pair)
+        if not all(map(np.array_equal, a, b)):
+            return True
+        alive[alive] = ~(a[2] | cut)
+        if not alive.any():
+            break
+    return False
+
+
+def _difference(one: Gymnasium, other: Gymnasium) -> str:
+    a, b = vars(one), vars(other)
+    return ", ".join(
+        f"{key}: {a[key]} → {b[key]}"
+        for key in one.__dataclass_fields__
+        if a[key] != b[key]
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _first(task: Gymnasium) -> gymnasium.Env:
+    """One simulator a task, to be asked for its spaces."""
+    try:
+        return task.simulator()
+    except BcrlError:
+        raise
+    except Exception as error:  # whatever a foreign constructor does
+        why = f"can't be made: {type(error).__name__}: {error}"
+        raise ConfigError("env.id", task.id, why) from error
+
+
+def _made(fields: dict[str, Any]) -> Gymnasium:
+    return Gymnasium(**fields)
+
+
+ENV = Gymnasium

@@ -1,0 +1,118 @@
+"""A regression as fitted Q-iteration poses it, its fits, and a Q made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bcrl.pack import DERIVED, storable
+from bcrl.q import Values
+from bcrl.streams import stream
+
+
+@storable
+@dataclass(frozen=True)
+class Problem:
+    """One regression (one seed and action), with the points its fit is asked at.
+
+    A fit depends on nothing else, so that a problem can be stored in a model's place.
+    """
+
+    x: NDArray[np.float32]  # (n, d)
+    y: NDArray[np.float64]  # (n,)
+    multiplicity: NDArray[np.int64]  # (n,) how many rows each row stands for
+    queries: NDArray[np.float32]  # (m, d)
+    seed: int
+    path: tuple[int, ...]  # of the seed's stream "trees"
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """The fit's own randomness, from its beginning."""
+        return stream(self.seed, "trees", *self.path)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted model and its predictions at the rows (n,) and the queries (m,)."""
+
+    model: Any
+    fitted: NDArray[np.float64]
+    queried: NDArray[np.float64]
+
+
+class Regressor(Protocol):
+    """Fits many problems at once; constructor arguments are its YAML keys.
+
+    `finite_only`: whether it needs an environment with finitely many states.
+    """
+
+    finite_only: bool
+
+    def fit(self, problems: Sequence[Problem], keep: bool, threads: int) -> list[Fit]:
+        """Fits, in order; `keep=False` says that no model will be asked again."""
+
+    def predict(
+        self, models: Sequence[Any], x: Sequence[NDArray], threads: int
+    ) -> list[NDArray[np.float64]]:
+        """Each model's predictions (n,) at its own points (n, d)."""
+
+
+@storable
+@dataclass
+class Fitted:
+    """A model and what it was fitted to, from which it can be had again."""
+
+    problem: Problem  # without its queries
+    model: Any = field(default=None, metadata=DERIVED)
+
+    @classmethod
+    def of(cls, problem: Problem, fit: Fit) -> Fitted:
+        """The model of a fit, for as long as it may be asked."""
+        return cls(replace(problem, queries=problem.queries[:0]), fit.model)
+
+
+class Threads(Protocol):
+    """Whoever says how many threads predictions may take."""
+
+    threads: int
+
+
+@storable
+@dataclass(frozen=True)
+class Fits:
+    """Q as one model per seed and action; an action never seen predicts 0 (None)."""
+
+    models: Sequence[Sequence[Fitted | None]]
+    regressor: Regressor
+    team: Threads
+
+    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        self._restore()
+        cells = [
+            (s, a)
+            for s, row in enumerate(self.models)
+            for a, fitted in enumerate(row)
+            if fitted is not None and len(states[s])
+        ]
+        out = [np.zeros((len(x), n_actions)) for x in states]
+        found = self.regressor.predict(
+            [self.models[s][a].model for s, a in cells],
+            [states[s] for s, _ in cells],
+            self.team.threads,
+        )
+        for (s, a), values in zip(cells, found, strict=True):
+            out[s][:, a] = values
+        return np.stack(out) if isinstance(states, np.ndarray) else out
+
+    def _restore(self) -> None:
+        """Fit once more what came out of a checkpoint without its model."""
+        lost = [f for row in self.models for f in row if f and f.model is None]
+        if lost:
+            problems = [fitted.problem for fitted in lost]
+            fits = self.regressor.fit(problems, True, self.team.threads)
+            for fitted, fit in zip(lost, fits, strict=True):
+                fitted.model = fit.model
