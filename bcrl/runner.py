@@ -158,7 +158,7 @@ def _train(
 ) -> list[tuple[Plan, Seeds]]:
     """Do the jobs; what failed is added to `failed`, seeds that are busy returned."""
     workers = min(options["workers"], len(work))
-    threads = options["threads"] or max(1, _cores() // workers)
+    threads = options["threads"] or max(1, cores() // workers)
     origin = records.provenance()  # of the code that starts, not of what it becomes
     jobs = [
         training.Job(number, plan, seeds, threads, origin)
@@ -238,7 +238,7 @@ def told(failed: Failures) -> str:
     return "\n".join(lines)
 
 
-def _cores() -> int:
+def cores() -> int:
     """Cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

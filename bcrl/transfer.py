@@ -129,6 +129,11 @@ def warm_start(start: Start, previous: Learned) -> Start:
     return replace(start, initial=previous.residual)
 
 
+def hands_on_a_policy(transfers: Sequence[Transfer]) -> bool:
+    """Whether the next stage has a policy from the start: shaping alone gives none."""
+    return any(not isinstance(transfer, Shape) for transfer in transfers)
+
+
 def begin(transfers: Sequence[Transfer], previous: Learned | None) -> Start:
     """The start of a stage; without a previous stage there is nothing to transfer."""
     start = Start(previous)

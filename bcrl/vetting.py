@@ -28,6 +28,8 @@ RELEASED_OPTIONS = {
     ("boosting", "on"): "released",
     ("transfer", "shaping"): "shaping_released",
 }
+#: The env that a command completes by an id, after which its results are named.
+OPEN = "gymnasium"
 #: Hydra's own keys that matter in running jobs.
 RUNNING = (
     *("launcher", "callbacks", "output_subdir", "run", "sweep"),
@@ -160,12 +162,17 @@ def plan(job: DictConfig, hydra: DictConfig, folders: Sequence[str]) -> Plan:
             raise BcrlError(f"{group}: every run needs a choice of it")
     extra = tuple(f for f in folders if Path(f) != CONF)
     config, known = _plain(job), {}
+    env, named = choices["env"], ()
+    if env == OPEN:
+        named = (f"env.id='{config['env']['id']}'",)
+        env = str(config["env"]["id"]).rpartition(":")[2].replace("/", "-")
     for tag, released in ((None, False), (RELEASED, True)):
-        variant = (f"env={choices['env']}", *_usual(config, choices, released))
+        usual = _usual(config, choices, released)
+        variant = (f"env={choices['env']}", *named, *usual)
         known[tag] = _plain(composed(CONFIG_NAME, variant, extra))
         if not differences(config, known[tag]):
             break
-    made = compose.plan(config, known, choices["env"])
+    made = compose.plan(config, known, env)
     return replace(made, command=_command(hydra))
 
 

@@ -14,7 +14,7 @@ from bcrl.learners.dqn import DQN
 from bcrl.learners.lspi import LSPI
 from bcrl.q.quadratic import FEATURES
 from bcrl.stage import Stage
-from bcrl.transfer import Shape, warm_start
+from bcrl.transfer import hands_on_a_policy, warm_start
 
 FAMILY = "DQN"
 LOCKSTEP = 20
@@ -79,9 +79,7 @@ def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
                 own["steps"] = sum(values["steps"])
             own["steps"] = capped(own["steps"], chosen.scale["max_steps"])
             # Whoever starts without a policy fills the replay at random.
-            knows = number > 1 and (
-                not isinstance(chosen.transfer, Shape) or chosen.boost
-            )
+            knows = number > 1 and hands_on_a_policy(chosen.transfers)
             learner = DQN(
                 **own,
                 random_steps=0 if knows else settings.random_steps,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
 import gymnasium
@@ -91,10 +91,10 @@ class Gymnasium:
             raise ConfigError("env.action_vectors", self.action_vectors, why)
 
     def __hash__(self) -> int:
-        return hash(json.dumps(vars(self), sort_keys=True, default=str))
+        return hash(json.dumps(_fields(self), sort_keys=True, default=str))
 
     def __reduce__(self) -> tuple:
-        return _made, ({f: getattr(self, f) for f in self.__dataclass_fields__},)
+        return _made, (_fields(self),)  # what is cached stays here
 
     @property
     def actions(self) -> NDArray[np.float64] | None:
@@ -187,12 +187,13 @@ def differ(one: Gymnasium, other: Gymnasium) -> bool:
 
 
 def _difference(one: Gymnasium, other: Gymnasium) -> str:
-    a, b = vars(one), vars(other)
-    return ", ".join(
-        f"{key}: {a[key]} → {b[key]}"
-        for key in one.__dataclass_fields__
-        if a[key] != b[key]
-    )
+    a, b = _fields(one), _fields(other)
+    return ", ".join(f"{key}: {a[key]} → {b[key]}" for key in a if a[key] != b[key])
+
+
+def _fields(task: Gymnasium) -> dict[str, Any]:
+    """All that a task is made from."""
+    return {f.name: getattr(task, f.name) for f in fields(task)}
 
 
 @functools.lru_cache(maxsize=64)

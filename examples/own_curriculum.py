@@ -1,0 +1,24 @@
+"""An own curriculum on a Gymnasium environment: a mountain car whose engine weakens.
+
+The usual engine (0.001) never gets a randomly acting car up the hill within 200 steps,
+so there is nothing to learn from; through stronger engines there is, and boosting keeps
+what they have taught.
+"""
+
+import pandas as pd
+
+from bcrl.api import FQI, Boost, Forest, Gymnasium, run, stages
+
+forces = (0.005, 0.0035, 0.0025, 0.0015, 0.001)  # the last is MountainCar-v0's own
+tasks = [Gymnasium("MountainCar-v0", attributes={"force": f}) for f in forces]
+learner = FQI(iterations=10, episodes=100, epsilon=0.3, regressor=Forest(trees=20))
+methods = {
+    "FQI": stages(tasks[-1:] * 5, learner),
+    "C-FQI": stages(tasks, learner),
+    "BC-FQI": stages(tasks, learner, Boost()),
+}
+frames = {name: run(each, seeds=range(4)) for name, each in methods.items()}
+results = pd.concat(frames, names=["method", "row"])
+
+last = results[results.iteration == results.iteration.max()]
+print(last.groupby("method")[["return", "solved"]].mean())
