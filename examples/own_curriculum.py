@@ -9,15 +9,20 @@ import pandas as pd
 
 from bcrl.api import FQI, Boost, Forest, Gymnasium, run, stages
 
-forces = (0.005, 0.0035, 0.0025, 0.0015, 0.001)  # the last is MountainCar-v0's own
-tasks = [Gymnasium("MountainCar-v0", attributes={"force": f}) for f in forces]
-learner = FQI(iterations=10, episodes=100, epsilon=0.3, regressor=Forest(trees=20))
+forces = (0.005, 0.003, 0.0018, 0.001)  # the last is MountainCar-v0's own
+tasks = [
+    Gymnasium("MountainCar-v0", attributes={"force": force}, starts=10)
+    for force in forces
+]
+learner = FQI(iterations=8, episodes=100, epsilon=0.3, regressor=Forest(trees=20))
 methods = {
-    "FQI": stages(tasks[-1:] * 5, learner),
+    "FQI": stages(tasks[-1:] * 4, learner),
     "C-FQI": stages(tasks, learner),
     "BC-FQI": stages(tasks, learner, Boost()),
 }
-frames = {name: run(each, seeds=range(4)) for name, each in methods.items()}
+frames = {
+    name: run(each, seeds=range(3), progress=False) for name, each in methods.items()
+}
 results = pd.concat(frames, names=["method", "row"])
 
 last = results[results.iteration == results.iteration.max()]

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 WRAPPERS = (
     *("ClipReward", "DelayObservation", "FlattenObservation", "FrameStackObservation"),
     *("MaxAndSkipObservation", "RescaleObservation", "StickyAction"),
-    "TimeAwareObservation",
 )
 #: Arguments of `gymnasium.make` itself, and what opens windows.
 OURS = ("max_episode_steps", "disable_env_checker", "render_mode")

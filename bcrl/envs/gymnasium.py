@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import gymnasium
@@ -43,9 +43,9 @@ class Gymnasium:
     """  # noqa: E501
 
     id: str
-    kwargs: dict = field(default_factory=dict)
-    attributes: dict = field(default_factory=dict)
-    wrappers: list = field(default_factory=list)
+    kwargs: Any = None
+    attributes: Any = None
+    wrappers: Any = None
     observation: Any = None
     gamma: float = 0.99
     horizon: Any = None
@@ -63,6 +63,11 @@ class Gymnasium:
             why = did_you_mean(str(self.success), SUCCESS)
             raise ConfigError("env.success", self.success, why)
         at_least("env.starts", self.starts, 1)
+        for key, kind in (("kwargs", dict), ("attributes", dict), ("wrappers", list)):
+            value = getattr(self, key)
+            if not isinstance(value, (kind, type(None))):
+                noun = "names and values" if kind is dict else "a list of sections"
+                raise ConfigError(f"env.{key}", value, f"must be {noun}, or null")
         horizon = self.horizon or simulators.max_steps(self.id)
         if type(horizon) is not int:
             why = f"is needed: {self.id} has no limit of its own (a number of steps)"
@@ -78,8 +83,21 @@ class Gymnasium:
             why = f"has observations {seen}, only a Box can be learned from; "
             why += "env.observation=module.function makes an array of them"
             raise ConfigError("env.id", self.id, why)
+        if self.observation is not None:
+            self._check_map()
         if self.action_vectors is not None:
             self._check_vectors()
+
+    def _check_map(self) -> None:
+        try:
+            fits = self.state_dim > 0
+        except BcrlError:
+            raise
+        except Exception as error:  # whatever it does
+            why = f"{type(error).__name__}: {error}"
+            raise ConfigError("env.observation", self.observation, why) from error
+        if not fits:
+            raise ConfigError("env.observation", self.observation, "gives nothing")
 
     def _check_vectors(self) -> None:
         try:
@@ -118,7 +136,8 @@ class Gymnasium:
 
     def simulator(self) -> gymnasium.Env:
         """A new environment of this task, without a time limit."""
-        return simulators.made(self.id, self.kwargs, self.attributes, self.wrappers)
+        kwargs, attributes = self.kwargs or {}, self.attributes or {}
+        return simulators.made(self.id, kwargs, attributes, self.wrappers or [])
 
     def observed(self, observation: Any) -> NDArray[np.float64]:
         """An observation as a vector (d,)."""
@@ -163,6 +182,7 @@ class Gymnasium:
                 raise ConfigError("env.tasks", _difference(task, after), why)
 
 
+@functools.lru_cache(maxsize=256)
 def differ(one: Gymnasium, other: Gymnasium) -> bool:
     """Whether two tasks lead anywhere else under the same resets and actions."""
     if one.horizon != other.horizon or one.gamma != other.gamma:

@@ -1,0 +1,262 @@
+"""Gymnasium's environments as tasks: same episodes, kept apart, replayed, checked."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+from bcrl import pack
+from bcrl.api import DQN, FQI, Boost, Forest, Gymnasium, run, stages
+from bcrl.errors import BcrlError, ConfigError
+from bcrl.rollout import draws, play, start_states
+from bcrl.streams import stream
+from tests.conftest import plan, plans
+
+CAR = {"id": "MountainCar-v0", "horizon": 40}
+CURRICULA = ("mountain_car", "cart_pole", "acrobot")
+
+
+class Counter(gymnasium.Env):
+    """Counts its steps; `prize` at 5; truncates itself at 3 if told so."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
+    action_space = gymnasium.spaces.Discrete(2, start=7)
+
+    def __init__(self, stop=False, prize=1.0, broken=False):
+        self.stop, self.prize, self.broken, self.own = stop, prize, broken, 2.0
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps, self.own = 0, 2.0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        self.steps += 1
+        end, cut = self.steps == 5, self.stop and self.steps == 3
+        seen = np.full(1, np.nan if self.broken else self.steps, np.float32)
+        return seen, self.prize * end, end, cut, {}
+
+
+gymnasium.register("tests/Counter-v0", Counter, max_episode_steps=9)
+gymnasium.register("tests/Endless-v0", Counter)
+
+
+def played(task, episodes=3, seed=0):
+    """Random episodes of one seed."""
+    rng = stream(seed, "data", 1)
+    start = start_states(rng, task, episodes)[None]
+    u = draws(rng, task, episodes)[None]
+
+    def policy(now, u, alive):
+        return (u[..., 1] * task.n_actions).astype(np.intp)
+
+    return play(task, policy, start, u)
+
+
+def test_episodes_are_those_of_gymnasium_itself():
+    task = Gymnasium(**CAR, attributes={"force": 0.004})
+    found = played(task)
+    starts = start_states(stream(0, "data", 1), task, 3)
+    env = gymnasium.make("MountainCar-v0", max_episode_steps=40)
+    env.unwrapped.force = 0.004
+    for lane, draw in enumerate(starts[:, 0]):
+        seen, _ = env.reset(seed=int(draw * 2**53))
+        for t in range(found.length[0, lane]):
+            np.testing.assert_array_equal(found.state[0, lane, t], seen)
+            seen, reward, *_ = env.step(int(found.action[0, lane, t]))
+            assert reward == found.reward[0, lane, t]
+
+
+def test_terminated_is_absorbing_and_truncated_is_not():
+    ended, cut = (
+        played(Gymnasium("tests/Counter-v0", kwargs={"stop": stop}))
+        for stop in (False, True)
+    )
+    assert (ended.length == 5).all() and ended.absorbing[..., 4].all()
+    assert (cut.length == 3).all() and not cut.absorbing.any()
+    assert ended.solved("absorbed").all() and not ended.solved("survived").any()
+    assert not cut.solved("absorbed").any()
+    limited = played(Gymnasium("tests/Counter-v0", horizon=4))
+    assert (limited.length == 4).all() and not limited.absorbing.any()
+    assert limited.solved("survived").all()
+
+
+def test_truncation_bootstraps_in_dqn():
+    learner = DQN(steps=60, random_steps=0, learning_starts=10, replay_size=60)
+    task = Gymnasium("tests/Counter-v0", kwargs={"stop": True})
+    moments = list(learner.learn(*_alone(task, learner)))
+    replay = moments[-1].state()["replay"]
+    kept = replay.rows[0, : replay.size]
+    position, discount = kept[:, 0], kept[:, 2 + task.n_actions + 1]
+    assert set(position.tolist()) == {0.0, 1.0, 2.0}  # anew after three steps
+    assert (discount == np.float32(task.gamma)).all()
+
+
+def _alone(task, learner):
+    from bcrl.stage import Team
+    from bcrl.transfer import Start
+
+    (stage,) = stages([task], learner)
+    return stage, Start(), Team((0,), task.evaluation_states())
+
+
+@pytest.mark.parametrize("family", ["FQI", "DQN"])
+def test_a_seed_is_the_same_in_any_company(family):
+    forces = [{"force": 0.004}, {"force": 0.003}]
+    tasks = [Gymnasium(**CAR, attributes=each, starts=3) for each in forces]
+    learner = FQI(iterations=2, episodes=4, regressor=Forest(trees=3), epsilon=0.5)
+    if family == "DQN":
+        learner = DQN(steps=90, random_steps=20, learning_starts=30, evaluate_every=45)
+    course = stages(tasks, learner, Boost())
+    together = run(course, seeds=range(3), progress=False)
+    alone = run(course, seeds=[2], progress=False)
+    own = together[together.seed == 2].reset_index(drop=True)
+    assert own.equals(alone)
+    assert len(set(together.groupby("seed")["return"].sum())) > 1
+
+
+def test_lanes_out_of_a_checkpoint_go_on_in_the_middle_of_an_episode(tmp_path):
+    task = Gymnasium("CartPole-v1", horizon=30)
+    lanes, rng = task.lanes(), np.random.default_rng(0)
+    state = lanes.begin(rng.random((4, 1)))
+    for _ in range(20):
+        state, _, ended, cut = lanes.step(state, rng.integers(2, size=4), None)
+        over = ended | cut | (lanes.length == task.horizon)
+        state = lanes.restart(over, rng.random((4, 1)), state)
+    with open(tmp_path / "x.npz", "wb") as file:
+        pack.write(file, {}, lanes, [task])
+    again = pack.read(tmp_path / "x.npz", [task])
+    assert not again.running  # no simulator is stored
+    for action in rng.integers(2, size=(5, 4)):
+        for a, b in zip(
+            lanes.step(state, action, None),
+            again.step(state, action, None),
+            strict=True,
+        ):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_a_parameter_that_is_not_applied_is_found():
+    one, other = ([{"LINK_LENGTH_2": x} for x in pair] for pair in ((1, 2), (1, 1)))
+    for attributes in (one, other):  # Gymnasium's dynamics use the centre of mass only
+        tasks = [Gymnasium("Acrobot-v1", attributes=a) for a in attributes]
+        if attributes is one:
+            with pytest.raises(ConfigError, match="behave alike"):
+                Gymnasium.check_tasks(tasks)
+        else:
+            Gymnasium.check_tasks(tasks)  # the same task twice is meant
+    unchecked = [Gymnasium("Acrobot-v1", attributes=a, verify=False) for a in one]
+    Gymnasium.check_tasks(unchecked)
+
+
+@pytest.mark.parametrize("env", CURRICULA)
+def test_shipped_curricula_apply_their_parameters(env):
+    tasks = plan(f"env={env}").tasks
+    for task in tasks:
+        there = task.simulator().unwrapped
+        for key, value in task.attributes.items():
+            assert getattr(there, key) == value
+    if env == "cart_pole":
+        for task in tasks:
+            there = task.simulator().unwrapped
+            derived = there.masspole * there.length
+            assert there.polemass_length == pytest.approx(derived)
+
+
+@pytest.mark.parametrize("env", CURRICULA)
+def test_all_variants_compose(env):
+    variants = "variant=plain,C,B,BC,SC,SBC"
+    made = plans(f"env={env}", "algorithm=dqn,fqi", variants, multirun=True)
+    assert len({p.directory for p in made}) == 12
+    assert not any(p.tag for p in made)
+
+
+def test_an_id_of_the_command_names_the_folder():
+    id_, tasks = (
+        "env.id=CartPole-v1",
+        "env.tasks.attributes=[{gravity: 5.0},{gravity: 9.8}]",
+    )
+    (alone,) = plans("env=gymnasium", id_)
+    assert str(alone.directory) == "runs/quick/CartPole-v1/FQI"
+    (own,) = plans("env=gymnasium", id_, tasks, "variant=BC")
+    (other,) = plans("env=gymnasium", id_, tasks, "variant=C")
+    assert own.tag == other.tag and own.name.startswith("BC-FQI@")
+    (space,) = plans("env=gymnasium", "env.id=tests/Counter-v0")
+    assert space.directory.parts[-2] == "tests-Counter-v0"
+
+
+BAD = {
+    "no id": ([], "env.id"),
+    "a misspelt id": (["env.id=CartPol-v1"], "did you mean CartPole-v1?"),
+    "a foreign module": (["env.id=os:CartPole-v1"], "BCRL_TRUST=os"),
+    "continuous actions": (["env.id=Pendulum-v1"], "only Discrete"),
+    "no Box": (["env.id=FrozenLake-v1"], "only a Box"),
+    "no horizon": (["env.id=tests/Endless-v0"], "env.horizon"),
+    "an unknown argument": (["env.kwargs={prise: 2.0}"], "did you mean prize?"),
+    "our argument": (["env.kwargs={render_mode: human}"], "is set by bcrl"),
+    "an unknown attribute": (["env.attributes={priz: 2}"], "did you mean prize?"),
+    "a hidden attribute": (["env.attributes={_np_random: 2}"], "_np_random"),
+    "no plain attribute": (["env.attributes={action_space: 2}"], "action_space"),
+    "text for a number": (["env.attributes={prize: x}"], "must be like 1.0"),
+    "a reset attribute": (["env.attributes={own: 3.0}"], "again after a reset"),
+    "an unknown wrapper": (["env.wrappers=[{name: RecordVideo}]"], "known:"),
+    "a nameless wrapper": (["env.wrappers=[StickyAction]"], "needs a name"),
+    "a wrapper's argument": (
+        ["env.wrappers=[{name: StickyAction, prob: 0.1}]"],
+        "repeat_action_probability",
+    ),
+    "an untrusted map": (["env.observation=os.getcwd"], "BCRL_TRUST=os"),
+    "success": (["env.success=survive"], "did you mean survived?"),
+    "no starts": (["env.starts=0"], "env.starts"),
+    "two kinds of task": (
+        ["env.kwargs={prize: 1.0}", "env.tasks.kwargs=[{prize: 2.0},{}]"],
+        "env.tasks.kwargs decides",
+    ),
+    "tasks of other sizes": (
+        ["env.tasks.wrappers=[[{name: FrameStackObservation, stack_size: 2}],[]]"],
+        "state_dim",
+    ),
+    "no vectors": (["transfer=residual_policy"], "env.action_vectors"),
+    "wrong vectors": (["env.action_vectors=[[1]]"], "must be 2 vectors"),
+    "q_error": (["env.metrics=[q_error]"], "no Q*"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_be_is_refused_before_work(name):
+    overrides, words = BAD[name]
+    given = [] if name == "no id" else ["env.id=tests/Counter-v0"]
+    given = [o for o in given if not any(x.startswith("env.id") for x in overrides)]
+    if name == "no vectors":
+        given += ["algorithm=dqn", "curriculum=on"]
+        given += ["env.tasks.kwargs=[{prize: 1.0},{prize: 2.0}]"]
+    with pytest.raises(BcrlError) as error:
+        plans("env=gymnasium", *given, *overrides)
+    assert words in str(error.value)
+
+
+def test_values_that_are_not_finite_are_an_error_by_name():
+    task = Gymnasium("tests/Counter-v0", kwargs={"broken": True})
+    with pytest.raises(BcrlError, match=r"tests/Counter-v0: .*not finite"):
+        played(task)
+
+
+def test_a_map_joins_tasks_with_different_observations(tmp_path, monkeypatch):
+    (tmp_path / "my_maps.py").write_text(
+        "import numpy as np\n\n\ndef padded(seen):\n"
+        "    return np.resize([*seen, 0.0, 0.0], 2)\n\n\n"
+        "def cell(seen):\n    return np.array([seen // 4, seen % 4], float)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("BCRL_TRUST", "my_maps")
+    timed = [{"name": "FrameStackObservation", "stack_size": 2}]
+    tasks = [
+        Gymnasium("tests/Counter-v0", observation="my_maps.padded"),
+        Gymnasium("tests/Counter-v0", wrappers=timed),
+    ]
+    Gymnasium.check_tasks(tasks)
+    learner = FQI(iterations=1, episodes=3, regressor=Forest(trees=2))
+    found = run(stages(tasks, learner, Boost()), seeds=[0], progress=False)
+    assert list(found.task) == [1, 2]
+    lake = Gymnasium("FrozenLake-v1", observation="my_maps.cell")
+    assert lake.state_dim == 2 and lake.n_actions == 4
