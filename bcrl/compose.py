@@ -115,7 +115,9 @@ def _variant(algorithm_name: str, chosen: Composition) -> str:
         return "RPL"
     if isinstance(chosen.transfer, PolicyReuse):
         return f"PPR-{whole}" if chosen.boost else "PPR"
-    return whole
+    if chosen.transfer is None or isinstance(chosen.transfer, Shape):
+        return whole
+    return f"{type(chosen.transfer).__name__}-{whole}"  # the user's own
 
 
 def _device(wanted: str, family: str) -> str:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from bcrl import trust
 from bcrl.config import Choice, construct, one_of
 from bcrl.curriculum import CURRICULA
 from bcrl.envs import Env
@@ -29,7 +30,7 @@ class Composition:
     tasks: tuple[Env, ...]  # easiest first, the target last
     order: tuple[int, ...]  # the task of each slot
     boost: Boost | None
-    transfer: Shape | PolicyReuse | ResidualPolicy | None
+    transfer: Transfer | None
     scale: Plain
 
     @property
@@ -47,8 +48,7 @@ class Composition:
 def composition(config: Plain, tasks: list[Env]) -> Composition:
     """The groups' choices, as far as they make sense together."""
     name = config["curriculum"]["name"]
-    one_of("curriculum.name", name, list(CURRICULA))
-    curriculum = name != "off"
+    curriculum, ordered = name != "off", _curriculum(name)
     boost, transfer = boost_of(config["boosting"]), transfer_of(config["transfer"])
     if len(tasks) == 1 and (curriculum or boost or transfer):
         key = "curriculum" if curriculum else "boosting" if boost else "transfer"
@@ -70,11 +70,22 @@ def composition(config: Plain, tasks: list[Env]) -> Composition:
             "about: boosting=off"
         )
         raise ConfigError("transfer", "residual_policy", why)
-    order = CURRICULA[name](len(tasks))
+    order = ordered(len(tasks))
+    if not set(order) <= set(range(len(tasks))):
+        why = f"visits {order}, but the tasks are 0 to {len(tasks) - 1}"
+        raise ConfigError("curriculum", name, why)
     if len(order) != len(tasks):
         why = f"has {len(order)} slots, budgets are lists with one entry a task"
         raise ConfigError("curriculum", name, f"{why} ({len(tasks)})")
     return Composition(tuple(tasks), tuple(order), boost, transfer, config["scale"])
+
+
+def _curriculum(name: object) -> Callable[[int], list[int]]:
+    """The order called `name`, or a trusted function `module.name` of the user's."""
+    if isinstance(name, str) and "." in name:
+        return trust.attribute("curriculum.name", name, name)
+    one_of("curriculum.name", name, list(CURRICULA))
+    return CURRICULA[name]
 
 
 def boost_of(section: Plain) -> Boost | None:
@@ -88,12 +99,16 @@ def boost_of(section: Plain) -> Boost | None:
     return boost
 
 
-def transfer_of(section: Plain) -> Shape | PolicyReuse | ResidualPolicy | None:
-    values = _named("transfer", section, ["none", *TRANSFERS])
-    if section["name"] == "none":
+def transfer_of(section: Plain) -> Transfer | None:
+    """The transfer chosen besides boosting, one of ours or a trusted `module.Class`."""
+    name = section.get("name") if isinstance(section, dict) else None
+    own = [name] if isinstance(name, str) and "." in name else []
+    values = _named("transfer", section, ["none", *TRANSFERS, *own])
+    if name == "none":
         construct("transfer", Choice, section)
         return None
-    transfer = construct("transfer", TRANSFERS[section["name"]], values)
+    cls = trust.component("transfer.name", name, name) if own else TRANSFERS[name]
+    transfer = construct("transfer", cls, values)
     if isinstance(transfer, Shape):
         one_of("transfer.next_state", transfer.next_state, ["stored", "before_reset"])
     return transfer

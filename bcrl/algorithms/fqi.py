@@ -79,7 +79,7 @@ def _check_transfers(chosen: Composition) -> None:
     if chosen.boost not in (None, Boost()):
         why = "is the released DQN's reading; the released FQI boosts as boosting=on"
         raise ConfigError("boosting", "released", why)
-    if chosen.transfer not in (None, Shape()):
+    if isinstance(chosen.transfer, Shape) and chosen.transfer != Shape():
         why = "is the released DQN's reading; FQI knows transfer=shaping"
         raise ConfigError("transfer", "shaping_released", why)
 
