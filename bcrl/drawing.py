@@ -128,8 +128,8 @@ def _car_on_hill(env: Any, path: NDArray, force: Any) -> Canvas:
         canvas.line([(-1.0, y), (-1.0, y + 0.05)], VERMILION, 2)
     at, speed = path[-1]
     p0 = min(max(at, -1.25), 1.25)
-    slope = 2 * p0 + 1 if p0 < 0 else (1 + 5 * p0 * p0) ** -1.5
-    along = np.array([1.0, slope]) / math.hypot(1.0, slope)
+    along = np.array([2e-3, float(hill(p0 + 1e-3) - hill(p0 - 1e-3))])
+    along /= np.linalg.norm(along)
     up = np.array([-along[1], along[0]])
     foot = np.array([p0, float(hill(p0))])
 
@@ -209,7 +209,7 @@ def _linear_system(env: Any, path: NDArray, force: Any) -> Canvas:
         (left + border, bottom + border),
         (left + side - border, bottom + side - border),
     )
-    canvas.disc(at, 0.11, BLUE)
+    canvas.disc(at, 0.09, BLUE)
     canvas.arrow(at, 0.8 * path[-1][[1, 3]], BLUE, 2.5)
     if force is not None:
         canvas.arrow(at, 0.8 * np.asarray(force), ORANGE, 2.5)

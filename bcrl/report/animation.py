@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from bcrl.drawing import draw, frames_per_second
+from bcrl.envs import Env
 from bcrl.errors import BcrlError, did_you_mean
 from bcrl.files import write_atomically
 from bcrl.report.findings import unreadable
@@ -83,11 +84,18 @@ def frames(variant: Variant, seed: int) -> Iterator[tuple[NDArray[np.uint8], int
         )
         raise unreadable(variant.npz(seed), what)
     duration = 1000 // frames_per_second(env)
+    pictures = _drawn(env, states, actions, f"{variant.name}, seed {seed}")
+    for t, picture in enumerate(pictures):
+        yield picture, PAUSE if t == len(actions) else duration
+
+
+def _drawn(
+    env: Env, states: NDArray, actions: NDArray, caption: str
+) -> Iterator[NDArray[np.uint8]]:
+    """An episode's T + 1 pictures, each after the states so far."""
     for t in range(len(states)):
-        last = t == len(actions)
-        caption = f"{variant.name}, seed {seed}, step {t}"
-        action = None if last else actions[t]
-        yield draw(env, states[: t + 1], action, caption), PAUSE if last else duration
+        action = actions[t] if t < len(actions) else None
+        yield draw(env, states[: t + 1], action, f"{caption}, step {t}")
 
 
 def _recorded(variant: Variant, seed: int) -> tuple[NDArray, NDArray]:
@@ -105,7 +113,9 @@ def _write(
 ) -> Path:
     """A GIF that repeats, all frames with the palette of a middle one."""
     images = [Image.fromarray(picture) for picture in pictures]
-    palette = images[(len(images) - 1) // 2].quantize(COLOURS)
+    palette = images[(len(images) - 1) // 2].quantize(
+        COLOURS, Image.Quantize.MAXCOVERAGE
+    )
     first, *others = (
         image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
     )
