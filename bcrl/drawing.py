@@ -93,7 +93,8 @@ def draw(
     The last state is the present one; `action`, a number or a force (k,), is what
     is done in it. `caption` stands below the picture.
     """
-    force = action if action is None or np.ndim(action) else env.actions[action]
+    known = action is not None and np.ndim(action) == 0 and env.actions is not None
+    force = env.actions[action] if known else action
     canvas = _drawing(env)[0](env, np.asarray(path, float), force)
     canvas.text(12, SIZE - 10, caption, "ld")
     return canvas.picture()
