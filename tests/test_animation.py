@@ -137,6 +137,9 @@ def test_which_variants_are_shown(tmp_path, capsys):
     assert [p.name for p in out.glob("*.gif")] == [
         "agent_car_on_hill_FQI@mine_smoke.gif"
     ]
+    other = tmp_path / "other"
+    write_cars(other, "B-FQI@mine")  # there is no untagged one
+    assert report(other, "--gif") == 0 and len(list(other.rglob("*.gif"))) == 1
     capsys.readouterr()
     assert report(tmp_path, "--gif", "BC-FQ") == 2
     assert "did you mean BC-FQI?" in capsys.readouterr().err

@@ -50,15 +50,16 @@ def _chosen(runs: Runs, tag: str | None, asked: Sequence[str]) -> list[Variant]:
                 raise BcrlError(f"--gif {name}: {did_you_mean(name, known)}")
         return [variant for variant in runs.variants if variant.name in asked]
     best: dict[tuple[str, str], Variant] = {}
-    for variant in (v for v in runs.variants if v.tag == tag):
+    for variant in (v for v in runs.variants if tag in (None, v.tag)):
         rival = best.setdefault((variant.env, variant.family), variant)
         best[variant.env, variant.family] = max(rival, variant, key=_merit)
     return list(best.values())
 
 
-def _merit(variant: Variant) -> tuple[bool, float]:
-    """What makes a variant be shown: that it is BC-, else its last mean return."""
-    return variant.method.startswith("BC-"), float(_last_returns(variant).mean())
+def _merit(variant: Variant) -> tuple[bool, bool, float]:
+    """What makes a variant be shown: no tag, then BC-, then its last mean return."""
+    boosted = variant.method.startswith("BC-")
+    return variant.tag is None, boosted, float(_last_returns(variant).mean())
 
 
 def _last_returns(variant: Variant) -> NDArray[np.float64]:
