@@ -15,11 +15,12 @@ from bcrl import probes
 from bcrl.algorithms import algorithm
 from bcrl.composition import Composition, composition
 from bcrl.config import Choice, Config, construct, one_of
-from bcrl.envs import Env, env_class, is_simulated
+from bcrl.envs import Env, is_simulated
 from bcrl.errors import ConfigError, at_least, did_you_mean
 from bcrl.identity import Plain, differences
 from bcrl.safety import check_name
 from bcrl.stage import Stage
+from bcrl.tasks import tasks_of
 from bcrl.transfer import PolicyReuse, ResidualPolicy, Shape
 
 
@@ -171,44 +172,11 @@ def _check_outputs(config: Plain) -> None:
 
 def _tasks(section: Plain) -> tuple[list[Env], tuple[str, ...]]:
     """The environment's tasks, easiest first, and the metrics to record."""
-    if not isinstance(section, dict) or not isinstance(section.get("name"), str):
-        raise ConfigError("env", section, "must have a name")
-    cls = env_class(section["name"])
-    tasks = [
-        construct("env", cls, _constants(section) | parameters)
-        for parameters in _parameters(section)
-    ]
+    tasks = tasks_of(section)
     if is_simulated(tasks[-1]):
-        cls.check_tasks(tasks)
+        tasks[-1].check_tasks(tasks)
     metrics = section.get("metrics")
     if not isinstance(metrics, list) or not metrics:
         raise ConfigError("env.metrics", metrics, "must be a list of metric names")
     probes.check(metrics, tasks[-1])
     return tasks, tuple(metrics)
-
-
-def _constants(section: Plain) -> Plain:
-    """What an environment is constructed with in every task."""
-    others = ("name", "tasks", "metrics", "paper_seeds")
-    return {k: v for k, v in section.items() if k not in others}
-
-
-def _parameters(section: Plain) -> list[Plain]:
-    """What differs between tasks, for each task; null leaves a parameter out."""
-    parameters = section.get("tasks")
-    if not isinstance(parameters, dict) or not parameters:
-        raise ConfigError("env.tasks", parameters, "must map a parameter to its values")
-    varied = {k: v for k, v in parameters.items() if v is not None}
-    if not varied:
-        return [{}]
-    lengths = {k: len(v) if isinstance(v, list) else 0 for k, v in varied.items()}
-    if len(set(lengths.values())) != 1 or 0 in lengths.values():
-        why = "every parameter needs a list with one value a task, all of one length"
-        raise ConfigError("env.tasks", varied, why)
-    for name in varied:
-        if section.get(name):  # {}, [] and null say nothing
-            raise ConfigError(f"env.{name}", section[name], f"env.tasks.{name} decides")
-    return [
-        dict(zip(varied, values, strict=True))
-        for values in zip(*varied.values(), strict=True)
-    ]

@@ -11,17 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.envs import Env
-from bcrl.probes import probed_states, scene
-from bcrl.rollout import CHOICES, play, start_states, success_of
+from bcrl.probes import probed_states, scene, trajectory
+from bcrl.rollout import CHOICES, Episodes, play, start_states, success_of
 from bcrl.stage import Moment
 from bcrl.streams import stream
 
 
 def evaluate(now: Moment, seeds: Sequence[int]) -> list[dict[str, float]]:
-    """Each seed's columns of docs/metrics.md, in the unwrapped task of the stage.
+    """Each seed's columns of docs/metrics.md, in the unwrapped task of the stage."""
+    return _evaluate(now, seeds)[0]
 
-    The exploring policy and the greedy one meet the same starts and the same noise,
-    which depend on seed, stage and step alone: evaluating changes no training.
+
+def _evaluate(
+    now: Moment, seeds: Sequence[int]
+) -> tuple[list[dict[str, float]], Episodes]:
+    """Each seed's columns, and the episodes behind them: exploring, then greedy ones.
+
+    Both policies meet the same starts and the same noise, which depend on seed, stage
+    and step alone: evaluating changes no training.
     """
     env, n = now.stage.env, now.episodes
     rngs = [
@@ -38,12 +45,13 @@ def evaluate(now: Moment, seeds: Sequence[int]) -> list[dict[str, float]]:
         "success_rate": played.solved(success_of(env)),
     }
     best = np.asarray(now.learned.q(start, env.n_actions)).max(-1)
-    return [
+    rows = [
         {name: float(values[s, :n].mean()) for name, values in outcomes.items()}
         | {"q_mean": float(best[s].mean()), "loss": float(now.loss[s])}
         | {f"greedy_{k}": float(values[s, n:].mean()) for k, values in outcomes.items()}
         for s in range(len(seeds))
     ]
+    return rows, played
 
 
 @dataclass
@@ -65,18 +73,20 @@ class StepProbe:
 
     def measure(self, now: Moment) -> list[dict[str, float]]:
         """Each seed's row of the CSV."""
+        rows, played = _evaluate(now, self.seeds)
         if now.last_of_stage:
+            self._shown, self._first = played, now.episodes  # the first greedy one
             env, n = now.stage.env, len(self.seeds)
             asked = np.broadcast_to(self.states, (n, *self.states.shape))
             q = np.asarray(now.learned.q(asked, env.n_actions), np.float32)
             self.kept.append((now.stage.learner.name, q))
-        return evaluate(now, self.seeds)
+        return rows
 
     def arrays(self, s: int) -> dict[str, NDArray]:
-        """What seed number s ends with: the stages' Q at `states`."""
+        """What seed number s ends with: the stages' Q at `states`, an episode."""
         kept = np.stack([q[s] for _, q in self.kept])
         found = {"states": self.states, "q": kept[-1], "q_stages": kept}
-        return found | scene(self.tasks)
+        return found | trajectory(self._shown, s, self._first) | scene(self.tasks)
 
     def facts(self) -> dict[str, Any]:
         """What else is known of the run: the learner of each stage."""

@@ -15,7 +15,14 @@ from bcrl.envs import Env, is_simulated
 from bcrl.errors import BcrlError, ConfigError, did_you_mean
 from bcrl.learners.fqi import Iteration
 from bcrl.q import Values
-from bcrl.rollout import draws, evaluation_starts, rollout, success_of
+from bcrl.rollout import (
+    Episodes,
+    draws,
+    evaluation_starts,
+    rollout,
+    start_states,
+    success_of,
+)
 from bcrl.streams import stream
 
 
@@ -130,24 +137,42 @@ class Probe:
         )
         if snapshot.last_of_stage:
             self.kept.append(snapshot.probed_residual)
-            self._last = snapshot, episodes
+            self._last = snapshot
         return [{m: float(METRICS[m](v)) for m in self.metrics} for v in views]
 
     def arrays(self, s: int) -> dict[str, NDArray]:
         """What seed number s ends with: Q and residuals at the probed states."""
-        snapshot, episodes = self._last
         found = {
             "states": self.states,
-            "q": snapshot.probed_q[s],
+            "q": self._last.probed_q[s],
             "residuals": np.stack([each[s] for each in self.kept]),
         }
-        if episodes.length.shape[1] == 1:  # one evaluation episode: keep its path
-            found["trajectory"] = episodes.state[s, 0, : episodes.length[s, 0] + 1]
-        return found | scene(self.tasks)
+        return found | trajectory(self._shown, s, 0) | scene(self.tasks)
+
+    @cached_property
+    def _shown(self) -> Episodes:
+        """A greedy episode of each seed in the target task, after the last iteration.
+
+        Where the evaluation is one episode from the task's own start, this is it.
+        """
+        now = self._last
+        rngs = [stream(seed, "evaluation", now.count) for seed in self.seeds]
+        start = np.stack([start_states(rng, self.target, 1) for rng in rngs])
+        u = np.stack([draws(rng, self.target, 1) for rng in rngs])
+        return rollout(self.target, now.learned.q, start, u)
 
     def facts(self) -> dict[str, Any]:
         """What else is known of the run."""
         return {"optimum": self.optimum}
+
+
+def trajectory(played: Episodes, s: int, e: int) -> dict[str, NDArray]:
+    """Seed number s's episode number e, to be looked at: states and actions."""
+    length = played.length[s, e]
+    return {
+        "trajectory": played.state[s, e, : length + 1],  # (T + 1, d)
+        "trajectory_actions": played.action[s, e, :length],  # (T,), or forces (T, k)
+    }
 
 
 def scene(tasks: Sequence[Env]) -> dict[str, NDArray]:

@@ -60,6 +60,19 @@ class CarOnHill:
             raise ConfigError("env.mass", self.mass, "must be positive and finite (kg)")
         check_episodes(self.gamma, self.horizon)
 
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """What holds every state that can be arrived at, lost or won too, (2, 2).
+
+        |dv/dt| ≤ c + v² with c = u/m + g/2, and then v grows like a tangent; a car so
+        light that this gets infinite within a step has none.
+        """
+        root = math.sqrt(FORCE / self.mass + GRAVITY / 2.0)
+        angle = math.atan(MAX_SPEED / root) + root * STEP_TIME
+        speed = root * math.tan(angle) if angle < math.pi / 2.0 else math.inf
+        high = np.array([MAX_POSITION + STEP_TIME * speed, speed])
+        return np.stack([-high, high])
+
     def initial(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
         """The valley (−0.5, 0) for noise of shape (..., 0)."""
         return np.broadcast_to(np.array(START), (*noise.shape[:-1], 2)).copy()

@@ -90,6 +90,23 @@ class LinearSystem:
         return PRESETS[self.preset][self.task]
 
     @property
+    def bounds(self) -> NDArray[np.float64]:
+        """The lowest and the highest components of a state, (2, 4); some are infinite.
+
+        Friction holds the velocities below what a unit force and noise of at most ten
+        standard deviations keep up; the drift may lead beyond the walls by one step.
+        """
+        gain, friction, spread = self.constants
+        noise = 10.0 * point_mass.NOISE
+        fast = [max(spread[i], (gain + noise) / friction) for i in (1, 3)]
+        if self.task == "lq":
+            high = np.array([np.inf, fast[0], np.inf, fast[1]])
+            return np.stack([-high, high])
+        beyond = DT * (abs(self.drift) + noise)
+        low = [WALLS[0] - beyond, -fast[0], -PATHWAY, -fast[1]]
+        return np.array([low, [WALLS[1] + beyond, fast[0], PATHWAY, fast[1]]])
+
+    @property
     def linear_quadratic(self) -> tuple[NDArray[np.float64], ...] | None:
         """A, B, Q, R of s' = A s + B F, reward −s'ᵀ Q s' − Fᵀ R F; None if not so."""
         if self.task != "lq":

@@ -85,6 +85,11 @@ class Maze:
         return np.array([[a - w, 0.0, a + w, h], [b - w, 1.0 - h, b + w, 1.0]])
 
     @property
+    def bounds(self) -> NDArray[np.float64]:
+        """The lowest and the highest coordinates, (2, 2)."""
+        return np.array([[0.0, 0.0], [1.0, 1.0]])
+
+    @property
     def goal(self) -> NDArray[np.float64]:
         """Centre of the goal, shape (2,)."""
         return GOAL

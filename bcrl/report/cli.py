@@ -14,6 +14,7 @@ from bcrl import __version__
 from bcrl.errors import BcrlError
 from bcrl.files import make_directory, write_text
 from bcrl.report import style
+from bcrl.report.animation import animations
 from bcrl.report.curves import LINEAR, figure_methods
 from bcrl.report.document import claims_report
 from bcrl.report.figures import figure_1, figure_2, figure_5
@@ -60,6 +61,13 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument(
         "--tag",
         help="use the variants X@TAG instead of the plain ones",
+    )
+    result.add_argument(
+        "--gif",
+        nargs="*",
+        metavar="VARIANT",
+        help="also show a greedy episode of these variants (BC-FQI), or of every "
+        "environment's BC- one, else its best",
     )
     result.add_argument(
         "--allow-incomplete",
@@ -122,6 +130,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         out = options.out or options.runs_dir / "figures"
         make_directory(out, "--out")
         files, skipped = report(runs, out, list(chosen), options.tag)
+        if options.gif is not None:
+            shown, not_shown = animations(runs, out, options.tag, options.gif)
+            files, skipped = files + shown, skipped + not_shown
     except BcrlError as error:
         print(f"bcrl-report: {error}", file=sys.stderr)
         return 2

@@ -1,0 +1,126 @@
+"""GIFs of what was learned: a greedy episode in the target task, as recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from bcrl.drawing import draw, frames_per_second
+from bcrl.envs import Env
+from bcrl.errors import BcrlError, did_you_mean
+from bcrl.files import write_atomically
+from bcrl.report.findings import unreadable
+from bcrl.report.variants import Runs, Variant
+from bcrl.tasks import tasks_of
+
+COLOURS = 64  # of a GIF's palette
+PAUSE = 1500  # ms that the last frame stands
+RETURNS = ("greedy_return", "return")  # columns that say how good a policy is
+
+
+def animations(
+    runs: Runs, out: Path, tag: str | None, asked: Sequence[str] = ()
+) -> tuple[list[Path], list[str]]:
+    """Write a GIF for each variant chosen; the files, and what was skipped and why.
+
+    `asked`: names of variants (`BC-FQI`); without any, an environment's and family's
+    best. BcrlError if one isn't there.
+    """
+    files, skipped = [], []
+    for variant in _chosen(runs, tag, asked):
+        seed = typical_seed(variant)
+        name = f"agent_{variant.env}_{variant.name}_{runs.scale}.gif"
+        try:
+            shown = list(frames(variant, seed))
+            files.append(_write(out / name, *zip(*shown, strict=True)))
+        except BcrlError as error:
+            skipped.append(f"{name}: {error}")
+    return files, skipped
+
+
+def _chosen(runs: Runs, tag: str | None, asked: Sequence[str]) -> list[Variant]:
+    if asked:
+        known = {variant.name for variant in runs.variants}
+        for name in asked:
+            if name not in known:
+                raise BcrlError(f"--gif {name}: {did_you_mean(name, known)}")
+        return [variant for variant in runs.variants if variant.name in asked]
+    best: dict[tuple[str, str], Variant] = {}
+    for variant in (v for v in runs.variants if tag in (None, v.tag)):
+        rival = best.setdefault((variant.env, variant.family), variant)
+        best[variant.env, variant.family] = max(rival, variant, key=_merit)
+    return list(best.values())
+
+
+def _merit(variant: Variant) -> tuple[bool, bool, float]:
+    """What makes a variant be shown: no tag, then BC-, then its last mean return."""
+    boosted = variant.method.startswith("BC-")
+    return variant.tag is None, boosted, float(_last_returns(variant).mean())
+
+
+def _last_returns(variant: Variant) -> NDArray[np.float64]:
+    """Each seed's return at the end, (S,); zeros if none was measured."""
+    measured = [variant.metrics[name] for name in RETURNS if name in variant.metrics]
+    return measured[0][:, -1] if measured else np.zeros(len(variant.seeds))
+
+
+def typical_seed(variant: Variant) -> int:
+    """The seed with the median return at the end, of two the worse one."""
+    order = np.argsort(_last_returns(variant), kind="stable")
+    return variant.seeds[order[(len(order) - 1) // 2]]
+
+
+def frames(variant: Variant, seed: int) -> Iterator[tuple[NDArray[np.uint8], int]]:
+    """The pictures of a seed's recorded episode, and for how long each stands, ms."""
+    states, actions = _recorded(variant, seed)
+    document = variant.sidecars[variant.seeds.index(seed)]
+    env = tasks_of(document["config"]["env"])[-1]
+    if states.shape[1:] != (env.state_dim,):
+        what = (
+            f"has a trajectory of shape {states.shape}, expected (T, {env.state_dim})"
+        )
+        raise unreadable(variant.npz(seed), what)
+    duration = 1000 // frames_per_second(env)
+    pictures = _drawn(env, states, actions, f"{variant.name}, seed {seed}")
+    for t, picture in enumerate(pictures):
+        yield picture, PAUSE if t == len(actions) else duration
+
+
+def _drawn(
+    env: Env, states: NDArray, actions: NDArray, caption: str
+) -> Iterator[NDArray[np.uint8]]:
+    """An episode's T + 1 pictures, each after the states so far."""
+    for t in range(len(states)):
+        action = actions[t] if t < len(actions) else None
+        yield draw(env, states[: t + 1], action, f"{caption}, step {t}")
+
+
+def _recorded(variant: Variant, seed: int) -> tuple[NDArray, NDArray]:
+    """The states (T + 1, d) and actions (T, …) of the seed's last greedy episode."""
+    names = ("trajectory", "trajectory_actions")
+    states, actions = variant.arrays(seed, *names)
+    if states.ndim != 2 or len(states) != len(actions) + 1:
+        shapes = f"{states.shape} and {actions.shape}"
+        raise unreadable(variant.npz(seed), f"has a trajectory of shapes {shapes}")
+    return states, actions
+
+
+def _write(
+    path: Path, pictures: Sequence[NDArray[np.uint8]], durations: Iterable[int]
+) -> Path:
+    """A GIF that repeats, all frames with the palette of a middle one."""
+    images = [Image.fromarray(picture) for picture in pictures]
+    palette = images[(len(images) - 1) // 2].quantize(
+        COLOURS, Image.Quantize.MAXCOVERAGE
+    )
+    first, *others = (
+        image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
+    )
+    options = {"duration": list(durations), "loop": 0, "append_images": others}
+    return write_atomically(
+        path, lambda handle: first.save(handle, "GIF", save_all=True, **options)
+    )
