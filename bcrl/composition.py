@@ -61,7 +61,8 @@ def composition(config: Plain, tasks: list[Env]) -> Composition:
     if isinstance(transfer, (PolicyReuse, ResidualPolicy)) and not curriculum:
         why = "needs an earlier task whose policy helps: curriculum=on"
         raise ConfigError("transfer", config["transfer"]["name"], why)
-    if isinstance(transfer, ResidualPolicy) and tasks[-1].actions is None:
+    vectors = getattr(tasks[-1], "actions", None)
+    if isinstance(transfer, ResidualPolicy) and vectors is None:
         why = "combines actions as vectors, which env.action_vectors has to name"
         raise ConfigError("transfer", "residual_policy", why)
     if isinstance(transfer, ResidualPolicy) and boost:

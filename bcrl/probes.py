@@ -167,11 +167,12 @@ class Probe:
 
 
 def trajectory(played: Episodes, s: int, e: int) -> dict[str, NDArray]:
-    """Seed number s's episode number e, to be looked at: states and actions."""
+    """Seed number s's episode number e, to be looked at."""
     length = played.length[s, e]
     return {
         "trajectory": played.state[s, e, : length + 1],  # (T + 1, d)
         "trajectory_actions": played.action[s, e, :length],  # (T,), or forces (T, k)
+        "trajectory_start": played.start[s, e],  # a simulator's: what reset it
     }
 
 

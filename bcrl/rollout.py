@@ -26,6 +26,7 @@ class Episodes:
     reward: NDArray[np.float64]  # (S, E, T)
     absorbing: NDArray[np.bool_]  # (S, E, T)
     length: NDArray[np.intp]  # (S, E)
+    start: NDArray[np.float64]  # (S, E, …) what `env.initial` gave
 
     def discounted_return(self, gamma: float) -> NDArray[np.float64]:
         """Σ_t γ^t r_t of each episode, shape (S, E)."""
@@ -139,7 +140,7 @@ def play(
     parts = (state, action, reward, absorbing)
     # Copied, for sums over strides would depend on how many lanes there are.
     by_lane = [np.ascontiguousarray(np.moveaxis(part, 0, 2)) for part in parts]
-    return Episodes(*by_lane, length)
+    return Episodes(*by_lane, length, start)
 
 
 @functools.lru_cache(maxsize=64)
@@ -168,7 +169,7 @@ def _tabular_rollout(
     void = np.arange(u.shape[1]) >= length[..., None]
     _, reward, absorbing = (table[row[..., :-1], action] for table in tables)
     reward[void], absorbing[void] = 0.0, False
-    return Episodes(env.states()[row], action, reward, absorbing, length)
+    return Episodes(env.states()[row], action, reward, absorbing, length, start)
 
 
 @numba.njit(cache=True, nogil=True)

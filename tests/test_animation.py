@@ -174,3 +174,21 @@ def test_a_config_names_no_code_that_is_not_trusted(tmp_path, capsys):
     assert report(tmp_path, "--gif") == 0
     assert "isn't of this package" in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.gif"))
+
+
+def test_a_simulators_episode_is_played_once_more(tmp_path):
+    pytest.importorskip("pygame")
+    options = (f"runs_dir={tmp_path}", "env.horizon=12", "env.starts=2", *SMALL)
+    made = plan("env=cart_pole", "variant=BC", "tag=x", *options)
+    runner.run(made)
+    assert report(tmp_path, "--gif") == 0
+    (variant,) = load_runs(tmp_path, "smoke").variants
+    shown = [picture for picture, _ in frames(variant, 0)]
+    (actions,) = variant.arrays(0, "trajectory_actions")
+    assert len(shown) == len(actions) + 1
+    env = made.target.simulator("rgb_array")
+    (start,) = variant.arrays(0, "trajectory_start")
+    env.reset(seed=int(start[0] * 2**53))
+    for action, picture in zip(actions, shown[1:], strict=True):
+        env.step(action)
+        np.testing.assert_array_equal(picture, env.render())

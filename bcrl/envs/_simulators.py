@@ -52,7 +52,11 @@ def max_steps(name: str) -> int | None:
 
 
 def made(
-    name: str, kwargs: Mapping, attributes: Mapping, wrappers: Sequence
+    name: str,
+    kwargs: Mapping,
+    attributes: Mapping,
+    wrappers: Sequence,
+    render_mode: str | None = None,
 ) -> gymnasium.Env:
     """The environment, without a time limit; ConfigError for what it doesn't take."""
     spec = spec_of(name)
@@ -60,7 +64,8 @@ def made(
     with warnings.catch_warnings():  # of precision and of old versions, each time
         warnings.simplefilter("ignore", UserWarning)
         limits = {"max_episode_steps": -1, "disable_env_checker": True}
-        env = gymnasium.make(spec, **limits, **kwargs)
+        drawn = {"render_mode": render_mode} if render_mode else {}
+        env = gymnasium.make(spec, **drawn, **limits, **kwargs)
         for key, value in attributes.items():
             _set(env, key, value)
         for wrapper in wrappers:
@@ -151,6 +156,7 @@ class SimulatedLanes:
     taken: NDArray[np.int16] | None = None  # (…, horizon) actions
     length: NDArray[np.intp] | None = None  # (…) how many of them
     running: list[gymnasium.Env] = field(default_factory=list, metadata=DERIVED)
+    render_mode: str | None = None
 
     def begin(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
         """Reset every lane; the observations (…, d)."""
@@ -158,7 +164,7 @@ class SimulatedLanes:
         self.start = start.copy()
         self.length = np.zeros(shape, np.intp)
         self.taken = np.zeros((*shape, self.env.horizon), np.int16)
-        self.running = [self.env.simulator() for _ in range(self.length.size)]
+        self._make()
         state = np.empty((*shape, self.env.state_dim))
         return self.restart(np.ones(shape, bool), start, state)
 
@@ -215,11 +221,15 @@ class SimulatedLanes:
         simulator = self.running[lane]
         return simulator.step(action + _first_action(simulator))
 
+    def _make(self) -> None:
+        count, mode = self.length.size, self.render_mode
+        self.running = [self.env.simulator(mode) for _ in range(count)]
+
     def _wake(self) -> None:
         """Bring lanes that come out of a checkpoint to where they were."""
         if self.running or not self.length.size:
             return
-        self.running = [self.env.simulator() for _ in range(self.length.size)]
+        self._make()
         taken = self.taken.reshape(self.length.size, -1)
         for lane, length in enumerate(self.length.reshape(-1)):
             self._reset(lane)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
@@ -134,10 +134,28 @@ class Gymnasium:
     def _simulator(self) -> gymnasium.Env:
         return _first(self)
 
-    def simulator(self) -> gymnasium.Env:
+    def simulator(self, render_mode: str | None = None) -> gymnasium.Env:
         """A new environment of this task, without a time limit."""
-        kwargs, attributes = self.kwargs or {}, self.attributes or {}
-        return simulators.made(self.id, kwargs, attributes, self.wrappers or [])
+        parts = self.kwargs or {}, self.attributes or {}, self.wrappers or []
+        return simulators.made(self.id, *parts, render_mode)
+
+    def pictures(
+        self, start: NDArray[np.float64], actions: NDArray[np.integer]
+    ) -> Iterator[NDArray[np.uint8]]:
+        """The environment's own pictures of an episode, one more than actions.
+
+        BcrlError if it draws none.
+        """
+        lanes = simulators.SimulatedLanes(self, render_mode="rgb_array")
+        try:
+            lanes.begin(start[None])
+            yield lanes.running[0].render()
+            for action in actions:
+                lanes.step(None, action[None], None)
+                yield lanes.running[0].render()
+        except (gymnasium.error.Error, TypeError) as error:
+            text = "pip install 'boosted-curriculum-rl[rendering]' may be what it needs"
+            raise BcrlError(f"{self.id} draws nothing: {error}; {text}") from error
 
     def observed(self, observation: Any) -> NDArray[np.float64]:
         """An observation as a vector (d,)."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from bcrl.drawing import draw, frames_per_second
-from bcrl.envs import Env
+from bcrl.envs import Env, is_simulated
 from bcrl.errors import BcrlError, did_you_mean
 from bcrl.files import write_atomically
 from bcrl.report.findings import unreadable
@@ -85,7 +85,11 @@ def frames(variant: Variant, seed: int) -> Iterator[tuple[NDArray[np.uint8], int
         )
         raise unreadable(variant.npz(seed), what)
     duration = 1000 // frames_per_second(env)
-    pictures = _drawn(env, states, actions, f"{variant.name}, seed {seed}")
+    if is_simulated(env):
+        (start,) = variant.arrays(seed, "trajectory_start")
+        pictures = env.pictures(start, actions)
+    else:
+        pictures = _drawn(env, states, actions, f"{variant.name}, seed {seed}")
     for t, picture in enumerate(pictures):
         yield picture, PAUSE if t == len(actions) else duration
 
