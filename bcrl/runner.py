@@ -36,6 +36,8 @@ Failures = dict[Path, Failed]  # by the plan's directory
 class SeedsFailed(BcrlError):
     """Some seeds failed, all others are complete: which, why, and what reruns them."""
 
+    exit_code = 1
+
 
 def run(*plans: Plan) -> None:
     """Compute and record every seed of the plans that is not complete yet.
