@@ -102,7 +102,7 @@ def status(arguments: Namespace) -> str:
 
 
 def _ever_asked(directory: Path) -> list[int]:
-    """The seeds that the runs in a variant's folder were asked for, by their own word."""
+    """The seeds that a variant's folder was ever asked for, by what those begun say."""
     seeds: set[int] = set()
     for path in directory.glob("seed_*.json"):
         facts = records.read_facts(directory, int(path.stem.partition("_")[2]))

@@ -229,7 +229,7 @@ def told(failed: Failures) -> str:
     lines = [f"{seeds} failed, what else was asked for is complete:"]
     for lost in failed.values():
         reasons: dict[str, list[int]] = {}
-        for seed, why in lost.why.items():
+        for seed, why in sorted(lost.why.items()):
             reasons.setdefault(why, []).append(seed)
         for why, seeds in reasons.items():
             name = f"{lost.plan.env} {lost.plan.name}"

@@ -92,7 +92,10 @@ def _completed(flags: argparse.ArgumentParser) -> Namespace:
             typed, _ = flags.parse_known_intermixed_args(words)
     except SystemExit:  # a flag's own argument is missing: the shell proposes files
         sys.exit(0)
-    left = ["bcrl", *["-m"] * typed.multirun, *typed.overrides]
+    chosen = any(o.startswith(("env=", "experiment=")) for o in typed.overrides)
+    # Without an env nothing composes; most keys are the same in all of them.
+    supposed = ["env=maze"] * (not chosen)
+    left = ["bcrl", *["-m"] * typed.multirun, *supposed, *typed.overrides]
     os.environ[LINE] = " ".join(left) + " " * (line[-1:].isspace() or len(left) == 1)
     return typed
 

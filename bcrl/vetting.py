@@ -138,6 +138,10 @@ def _refuse_nonsense(
         if key in (*VARIANT_GROUPS, *OPTIONAL, "variant") and not named:
             text = f"{override.input_line}: name an option, or leave {key} out"
             raise BcrlError(text)
+        group = key.replace(".", "/")
+        if group != key and isinstance(value, str) and Path(CONF, group).is_dir():
+            text = f"{override.input_line}: an option is chosen by {group}={value}"
+            raise BcrlError(text)
         if key == "experiment" and isinstance(value, list):
             raise BcrlError("experiment: one at a time, or -m experiment=fig1,fig2")
         if key in OPTIONAL:

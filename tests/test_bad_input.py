@@ -18,6 +18,25 @@ BAD = {
         [MAZE, "+env.hieght=0.5"],
         ["env.hieght=0.5", "unknown key", "height"],
     ),
+    "another option's key": (
+        [MAZE, "transfer.nu=0.9"],
+        ["transfer.nu: unknown key; transfer=policy_reuse would have it"],
+    ),
+    "nearly another option's key": (
+        [MAZE, "algorithm.lspi.iterrations=1"],
+        ["did you mean algorithm.lspi.iterations, with algorithm=dqn?"],
+    ),
+    "another regressor's key": (
+        [MAZE, "algorithm/regressor=tabular", "algorithm.regressor.trees=9"],
+        ["algorithm/regressor=forest", "would have it"],
+    ),
+    "a group's typo": ([MAZE, "algorithm/regresor=forest"], ["algorithm/regressor?"]),
+    "unknown experiment": (["experiment=fgi1"], ["did you mean fig1?"]),
+    "unknown local": ([MAZE, "local=hoem"], ["local=hoem", "none"]),
+    "an option with a dot": (
+        [MAZE, "algorithm.regressor=tabular"],
+        ["chosen by algorithm/regressor=tabular"],
+    ),
     "no seeds": ([MAZE, "seeds.count=0"], ["seeds.count=0", "at least 1"]),
     "negative seed": ([MAZE, "seeds.first=-1"], ["seeds.first=-1", "at least 0"]),
     "no workers": ([MAZE, "workers=0"], ["workers=0", "at least 1"]),
@@ -91,6 +110,12 @@ def test_it_is_refused_by_key_value_and_what_is_allowed(case):
         assert words in str(refusal.value)
 
 
+def test_a_folder_is_looked_for_among_its_neighbours(tmp_path):
+    (tmp_path / "my_configs").mkdir()
+    with pytest.raises(BcrlError, match=r"did you mean my_configs\?"):
+        plans(MAZE, config_dir=str(tmp_path / "my_conifgs"))
+
+
 YAMLS = {
     "wrong type": ("seeds: {count: many}", ["seeds.count", "many"]),
     "unknown key": ("seeds: {cuont: 3}", ["seeds.cuont"]),
@@ -127,6 +152,7 @@ def test_a_sweep_whose_jobs_would_share_a_directory_is_refused():
         ["env=maze", "runs_dir=a_file/below"],
         ["env=maze", "runs_dir=/proc/runs"],
         ["env=maze", "--config-dir", "nowhere"],
+        ["--mutlirun", "env=maze"],
         ["env=maze", "--experimental-rerun", "x.pickle"],
     ],
 )
