@@ -80,8 +80,9 @@ def status(arguments: Namespace) -> str:
     If it names nothing but `runs_dir`, everything that was ever begun there.
     """
     if all(override.startswith("runs_dir=") for override in arguments.overrides):
-        arguments.overrides.append("env=maze")  # any: it is a required choice
-        root = vetting.plans(arguments)[0].root
+        any_ = [*arguments.overrides, "env=maze"]  # it is a required choice
+        (plan,) = vetting.plans(Namespace(**vars(arguments) | {"overrides": any_}))
+        root = plan.root
         folders = sorted(path.parent for path in root.glob("*/*/*/config.yaml"))
         if not folders:
             raise BcrlError(f"runs_dir={root}: holds no runs")

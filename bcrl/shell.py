@@ -33,12 +33,14 @@ def arguments() -> Namespace:
         close = guess(unknown[0].partition("=")[0], _names(flags))
         raise BcrlError(f"{unknown[0]}: unknown flag; {close or 'see bcrl --help'}")
     given = [word for word in sys.argv[1:] if word not in asked.overrides]
-    line = _completed(flags) if asked.shell_completion else asked
-    if line.config_dir is None and own_folder().is_dir():
-        line.config_dir = str(own_folder())
-    if line.config_dir and not asked.config_dir:
-        given.append(f"--config-dir={line.config_dir}")
-    asked.config_dir = line.config_dir
+    folder = asked.config_dir
+    if asked.shell_completion:
+        folder = _completed(flags).config_dir
+    if folder is None and own_folder().is_dir():
+        folder = str(own_folder())
+    if folder != asked.config_dir:
+        given.append(f"--config-dir={folder}")
+    asked.config_dir = folder
     sys.argv[1:] = given + asked.overrides
     return asked
 

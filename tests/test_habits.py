@@ -276,11 +276,11 @@ def test_strict_makes_errors_of_numpys_warnings(tmp_path, monkeypatch, strict):
 def local(tmp_path):
     """Writes a user's local/default.yaml; gives the folder."""
 
-    def write(text: str, name: str = "default") -> str:
-        path = tmp_path / "mine" / "local" / f"{name}.yaml"
+    def write(text: str, name: str = "default", folder: str = "mine") -> str:
+        path = tmp_path / folder / "local" / f"{name}.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(f"# @package _global_\n{text}\n")
-        return str(tmp_path / "mine")
+        return str(tmp_path / folder)
 
     return write
 
@@ -309,9 +309,9 @@ def test_a_local_file_cannot_change_numbers_in_silence(local):
     typed = plan("env=maze", "algorithm.episodes=7")
     assert (p.tag, identity(p.config)) == (typed.tag, identity(typed.config))
     with pytest.raises(BcrlError, match="cuont"):
-        plans("env=maze", config_dir=local("seeds: {cuont: 3}"))
+        plans("env=maze", config_dir=local("seeds: {cuont: 3}", folder="a"))
     with pytest.raises(BcrlError, match="can't instantiate"):
-        plans("env=maze", config_dir=local("env: {x: {_target_: os.system}}"))
+        plans("env=maze", config_dir=local("env: {_target_: os.system}", folder="b"))
 
 
 def test_the_users_folder_is_found_and_named_in_what_is_recorded(
