@@ -181,10 +181,7 @@ def provenance() -> dict[str, Any]:
             "python": platform.python_version(),
             **{name: version(name) for name in LIBRARIES},
         },
-        "git": {
-            "revision": _git("rev-parse", "HEAD"),
-            "dirty": _git("status", "--porcelain") not in ("", None),
-        },
+        "git": _revision(),
         "machine": {
             "system": platform.platform(),
             "processor": _processor(),
@@ -193,8 +190,19 @@ def provenance() -> dict[str, Any]:
     }
 
 
+def _revision() -> dict[str, Any]:
+    """The git revision of the checkout that this package is part of, if it is of one.
+
+    An installed package may lie in somebody else's.
+    """
+    if _git("ls-files", "--error-unmatch", "__init__.py") is None:
+        return {"revision": None, "dirty": False}
+    dirty = _git("status", "--porcelain") not in ("", None)
+    return {"revision": _git("rev-parse", "HEAD"), "dirty": dirty}
+
+
 def _git(*arguments: str) -> str | None:
-    """What git says of the checkout this package lies in; None if it is not in one."""
+    """What git says in this package's folder; None if it has nothing to say."""
     here = Path(__file__).resolve().parent
     try:
         done = subprocess.run(
