@@ -149,6 +149,7 @@ def test_a_users_own_env_comes_from_a_folder_and_a_module(outside, tmp_path):
     place.parent.mkdir(parents=True)
     place.write_text(yaml)
     command = ("bcrl", "--config-dir=mine", "env=my_maze", "variant=BC", *FAST)
+    command += ("env.metrics=[return]",)
     refused = outside(*command)
     assert refused.returncode == 2 and "env.name=my_mazes" in refused.stderr
     done = outside(*command, BCRL_TRUST="my_mazes", PYTHONPATH=str(tmp_path))
