@@ -1,8 +1,12 @@
 """Bad input ends in one clear message before any work, and leaves nothing behind."""
 
+import re
+
 import pytest
 
+from bcrl.composed import CONF
 from bcrl.errors import BcrlError
+from bcrl.safety import check_name
 from tests.conftest import plans
 
 MAZE = "env=maze"
@@ -114,6 +118,36 @@ def test_a_folder_is_looked_for_among_its_neighbours(tmp_path):
     (tmp_path / "my_configs").mkdir()
     with pytest.raises(BcrlError, match=r"did you mean my_configs\?"):
         plans(MAZE, config_dir=str(tmp_path / "my_conifgs"))
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["a b", "a;b", "$(x)", "a,b", "a=b", "-x", ".x", "", "é", "a@b", "a*", "a|b", "#a"],
+)
+def test_a_name_that_a_shell_or_a_path_would_take_apart_is_refused(name):
+    with pytest.raises(BcrlError, match="tag=.*plain name"):
+        check_name("tag", name)
+
+
+@pytest.mark.parametrize("key", ["tag", "scale.name"])
+def test_whatever_names_a_directory_is_such_a_name(key):
+    with pytest.raises(BcrlError, match=f"{key}=a b: .*plain name"):
+        plans(MAZE, f"{key}='a b'")
+
+
+def test_an_env_is_a_plain_name_too(tmp_path):
+    (tmp_path / "env").mkdir()
+    text = (CONF / "env" / "maze.yaml").read_text()
+    (tmp_path / "env" / "my maze.yaml").write_text(text)
+    with pytest.raises(BcrlError, match="env=my maze: must be a plain name"):
+        plans("env='my maze'", config_dir=str(tmp_path))
+
+
+def test_every_directory_is_one_word_of_a_shell():
+    found = plans("experiment=fig2,fig4,fig4_released,search_nu", multirun=True)
+    assert len(found) == 4 + 7 + 3 + 3
+    for made in found:
+        assert re.fullmatch(r"[\w.@-]+(/[\w.@-]+)*", str(made.directory), re.ASCII)
 
 
 YAMLS = {

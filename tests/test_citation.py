@@ -1,4 +1,4 @@
-"""CITATION.cff has what Citation File Format 1.2.0 requires, and agrees with the code."""
+"""CITATION.cff has what its format's version 1.2.0 requires; there is one version."""
 
 import re
 import tomllib
