@@ -125,7 +125,7 @@ def test_a_folder_is_looked_for_among_its_neighbours(tmp_path):
     ["a b", "a;b", "$(x)", "a,b", "a=b", "-x", ".x", "", "é", "a@b", "a*", "a|b", "#a"],
 )
 def test_a_name_that_a_shell_or_a_path_would_take_apart_is_refused(name):
-    with pytest.raises(BcrlError, match="tag=.*plain name"):
+    with pytest.raises(BcrlError, match=r"tag=.*plain name"):
         check_name("tag", name)
 
 
@@ -144,8 +144,8 @@ def test_an_env_is_a_plain_name_too(tmp_path):
 
 
 def test_every_directory_is_one_word_of_a_shell():
-    found = plans("experiment=fig2,fig4,fig4_released,search_nu", multirun=True)
-    assert len(found) == 4 + 7 + 3 + 3
+    found = plans("experiment=fig4_released,search_nu", multirun=True)
+    assert len(found) == 3 + 3
     for made in found:
         assert re.fullmatch(r"[\w.@-]+(/[\w.@-]+)*", str(made.directory), re.ASCII)
 
