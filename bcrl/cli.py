@@ -18,7 +18,7 @@ from bcrl.composed import CONF, CONFIG_NAME
 from bcrl.errors import BcrlError
 from bcrl.files import make_directory
 from bcrl.interrupts import EXIT_CODE, Interrupted
-from bcrl.terminal import say
+from bcrl.terminal import say, show
 
 if TYPE_CHECKING:
     from bcrl.compose import Plan
@@ -33,7 +33,7 @@ def main() -> None:
         with guard.refusals():
             arguments = shell.arguments()
             if arguments.help:
-                print(shell.manual(arguments.config_dir))
+                show(shell.manual(arguments.config_dir))
                 return
             if plans := _vet(arguments):
                 make_directory(plans[0].root, "runs_dir")
@@ -60,14 +60,14 @@ def _vet(arguments: Namespace) -> list[Plan]:
     from bcrl import overview, records, vetting
 
     if arguments.status:
-        print(overview.status(arguments))
+        show(overview.status(arguments))
         return []
     plans = vetting.plans(arguments)
     if not (arguments.cfg or arguments.info):
         for plan in plans:
             records.check_directory(plan)
     if arguments.dry_run:
-        print(overview.dry_run(plans))
+        show(overview.dry_run(plans))
         return []
     if arguments.cfg or arguments.info or vetting.left_to_hydra(arguments):
         return _leave_to_hydra()
