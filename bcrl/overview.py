@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 from argparse import Namespace
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,20 +35,15 @@ def dry_run(plans: Sequence[Plan]) -> str:
         jobs = [n for n, (of, _) in enumerate(work) if of is plan]
         todo = [seed for n in jobs for seed in work[n][1]]
         done = str(len(plan.seeds) - len(records.pending(plan)))
-        cost = f"{sum(seconds[n] for n in jobs) / 60:.1f}"
+        cost = _minutes(sum(seconds[n] for n in jobs))
         where, which = str(plan.directory), _seeds(todo)
         rows.append((where, done, which, str(len(jobs)), cost))
+    hopeless = [why for lost in failed.values() for why in set(lost.why.values())]
     workers = plans[0].config["workers"]
-    hopeless = [str(why) for lost in failed.values() for why in {*lost.why.values()}]
-    return "\n".join(
-        [
-            *_aligned(rows),
-            *hopeless,
-            f"{len(work)} jobs, about {sum(seconds) / 60:.1f} core minutes, "
-            f"{_wall(seconds, workers) / 60:.1f} min with workers={workers}; "
-            "nothing was run or written",
-        ]
-    )
+    wall = _minutes(_wall(seconds, workers))
+    total = f"{len(work)} jobs, about {_minutes(sum(seconds))} core minutes"
+    last = f"{total}, {wall} min with workers={workers}; nothing was run or written"
+    return "\n".join([*_aligned(rows), *hopeless, last])
 
 
 def _wall(seconds: Sequence[float], workers: int) -> float:
@@ -66,7 +62,7 @@ class Asked:
     states: dict[int, str]  # by seed: one of `STATES`
     failed: dict[int, str]  # why
     undone: float  # seeds' worth of work that is left, but for those that failed
-    seconds: float  # of one core, that this work is expected to take
+    seconds: float  # of one core, that this work is expected to take; NaN: unknown
 
     @property
     def name(self) -> str:
@@ -95,9 +91,9 @@ def status(arguments: Namespace) -> str:
         counts, n = Counter(asked.states.values()), len(asked.states)
         done = f"{100 * (1 - (asked.undone + len(asked.failed)) / max(1, n)):.0f} %"
         cells = [str(counts[state] or "") for state in STATES]
-        rows.append((asked.name, str(n), *cells, done, f"{asked.seconds / 60:.1f}"))
-    total = sum(asked.seconds for asked in variants) / 60
-    rows.append(("in all", *[""] * (len(STATES) + 2), f"{total:.1f}"))
+        rows.append((asked.name, str(n), *cells, done, _minutes(asked.seconds)))
+    total = sum(asked.seconds for asked in variants)
+    rows.append(("in all", *[""] * (len(STATES) + 2), _minutes(total)))
     reasons = [line for asked in variants for line in _reasons(asked)]
     return "\n".join([*_aligned(rows), *reasons])
 
@@ -112,7 +108,7 @@ def _ever_asked(directory: Path) -> list[int]:
     return sorted(seeds)
 
 
-def _look(directory: Path, seeds: Sequence[int], seconds: float = 0.0) -> Asked:
+def _look(directory: Path, seeds: Sequence[int], seconds: float = math.nan) -> Asked:
     """Where a variant's seeds stand; one is expected to take so many core-seconds.
 
     What those that are complete took counts more.
@@ -125,7 +121,7 @@ def _look(directory: Path, seeds: Sequence[int], seconds: float = 0.0) -> Asked:
     left = [s for s in seeds if states[s] not in (COMPLETE, FAILED)]
     undone = sum(1.0 - begun.get(seed, 0.0) for seed in left)
     rate = sum(spent) / len(spent) if spent else seconds
-    return Asked(directory, states, failed, undone, undone * rate)
+    return Asked(directory, states, failed, undone, undone * rate if undone else 0.0)
 
 
 def _state(directory: Path, seed: int, facts: Mapping[str, Any]) -> str:
@@ -145,6 +141,10 @@ def _reasons(asked: Asked) -> Iterator[str]:
     for why in dict.fromkeys(asked.failed.values()):
         lost = [seed for seed, reason in asked.failed.items() if reason == why]
         yield f"{asked.name}, {named(lost)}: {why}"
+
+
+def _minutes(seconds: float) -> str:
+    return "?" if math.isnan(seconds) else f"{seconds / 60:.1f}"
 
 
 def _seeds(seeds: Sequence[int]) -> str:
