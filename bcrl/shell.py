@@ -56,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
 
 def own_folder() -> Path:
     """The user's folder of configs, which need not be there: ~/.config/bcrl."""
-    base = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
+    base = os.environ.get("XDG_CONFIG_HOME") or os.path.expanduser("~/.config")
     return Path(base, "bcrl")
 
 
