@@ -23,9 +23,14 @@ SCHEMA = 1  # raised when the content's meaning changes
 Seeds = tuple[int, ...]
 
 
-def save(plan: Plan, seeds: Seeds, content: Any, given: Sequence[Any]) -> None:
-    """Store `content`, which refers to what is `given`, as the team's checkpoint."""
-    about = _about(plan) | {"seeds": list(seeds)}
+def save(
+    plan: Plan, seeds: Seeds, share: float, content: Any, given: Sequence[Any]
+) -> None:
+    """Store `content`, which refers to what is `given`, as the team's checkpoint.
+
+    `share`: of the run, that is done.
+    """
+    about = _about(plan) | {"seeds": list(seeds), "share": share}
     write_atomically(
         _path(plan, seeds), lambda file: pack.write(file, about, content, given)
     )
@@ -40,18 +45,28 @@ def load(plan: Plan, seeds: Seeds, given: Sequence[Any]) -> Any:
         raise _remedy(error) from error
 
 
-def teams(plan: Plan) -> list[Seeds]:
-    """The teams of the plan's seeds that can go on from a checkpoint.
+def teams(plan: Plan) -> dict[Seeds, float]:
+    """The teams of the plan's seeds that can go on from a checkpoint, and its share.
 
     BcrlError for a file that is none. One of other code or another config counts as
     absent: what it would lead to is not what an uninterrupted run gives.
     """
     asked, here = set(plan.seeds), _about(plan)
-    found = []
-    for about in map(_read_about, _paths(plan)):
-        seeds = tuple(about.pop("seeds", ()))
+    found = {}
+    for about in map(_read_about, _paths(plan.directory)):
+        seeds, share = tuple(about.pop("seeds", ())), about.pop("share", 0.0)
         if about == here and asked.issuperset(seeds):
-            found.append(seeds)
+            found[seeds] = share
+    return found
+
+
+def shares(directory: Path) -> dict[int, float]:
+    """How much of its run each seed has behind it, by checkpoints of any code."""
+    found: dict[int, float] = {}
+    for path in _paths(directory):
+        with contextlib.suppress(BcrlError):
+            about = _read_about(path)
+            found |= dict.fromkeys(about.get("seeds", ()), about.get("share", 0.0))
     return found
 
 
@@ -62,15 +77,15 @@ def remove(plan: Plan, seeds: Seeds) -> None:
 
 def remove_done(plan: Plan) -> None:
     """Remove checkpoints all of whose seeds are complete."""
-    for path in _paths(plan):
+    for path in _paths(plan.directory):
         with contextlib.suppress(BcrlError):  # who asks for its seeds will be told
             seeds = _read_about(path).get("seeds", ())
             if all(is_complete(plan.directory, seed) for seed in seeds):
                 path.unlink(missing_ok=True)
 
 
-def _paths(plan: Plan) -> list[Path]:
-    return sorted(plan.directory.glob("checkpoint_*.npz"))
+def _paths(directory: Path) -> list[Path]:
+    return sorted(directory.glob("checkpoint_*.npz"))
 
 
 def _path(plan: Plan, seeds: Seeds) -> Path:

@@ -7,14 +7,16 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
+import yaml
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bcrl.errors import BcrlError, did_you_mean
-from bcrl.identity import flat
+from bcrl.bounds import check_file
+from bcrl.errors import BcrlError, closest, did_you_mean
+from bcrl.identity import Plain, flat
 from bcrl.sweeps import first_lines
 
 PACKAGE = Path(__file__).resolve().parent
@@ -47,10 +49,10 @@ def composed(name: str, overrides: tuple[str, ...], folders: Folders) -> DictCon
         raise BcrlError(text) from error
     if unknown := re.match(r"Could not override '([^']+)'", message):
         key = unknown[1]
-        add = f"one that isn't there is added with +{key}"
-        ours = not key.startswith("hydra.")
-        known = _known_keys(name, key, overrides, folders) if ours else add
-        message = f"{unknown[1]}: unknown key; {known}"
+        meant = f"one that isn't there is added with +{key}"
+        if not key.startswith("hydra."):
+            meant = _meant(name, key, overrides, folders)
+        message = f"{key}: unknown key; {meant}"
     raise BcrlError(message)
 
 
@@ -62,8 +64,21 @@ def _missing(error: MissingConfigException) -> str:
     return f"{group}={option}: {did_you_mean(option, error.options)}"
 
 
-def _known_keys(name: str, key: str, overrides: Sequence[str], folders: Folders) -> str:
-    """What `key` may have meant, among the keys of the same choice of groups."""
+def _meant(name: str, key: str, overrides: Sequence[str], folders: Folders) -> str:
+    """What an unknown key may mean: a known one, a group, or one of another option."""
+    options = _keys_of_options(folders)
+    if key in options:
+        return f"{' or '.join(options[key])} would have it"
+    known = _known_keys(name, overrides, folders)
+    match = closest(key, {*known, *options})
+    if match is None:
+        return "see bcrl --help"
+    with_ = "" if match in known else " or ".join(options[match])
+    return f"did you mean {match}{', with ' * bool(with_)}{with_}?"
+
+
+def _known_keys(name: str, overrides: Sequence[str], folders: Folders) -> Plain:
+    """The keys that there are with the same choice of groups."""
     groups = [o for o in overrides if "." not in o.split("=")[0] and o[0] not in "+~"]
     for asked in (tuple(groups), ("env=maze",)):
         if asked == overrides:
@@ -73,5 +88,28 @@ def _known_keys(name: str, key: str, overrides: Sequence[str], folders: Folders)
         except BcrlError:
             continue
         del job["hydra"]
-        return did_you_mean(key, flat(job))
-    return "see bcrl --help"
+        return flat(job)
+    return {}
+
+
+def _keys_of_options(folders: Folders) -> dict[str, list[str]]:
+    """Each key that an option brings into its section, and which options do so.
+
+    The groups themselves are there, too, with none.
+    """
+    found: dict[str, list[str]] = {}
+    for folder in map(Path, (CONF, *folders)):
+        for path in sorted((*folder.glob("*/*.yaml"), *folder.glob("*/*/*.yaml"))):
+            group = path.parent.relative_to(folder).as_posix()
+            found.setdefault(group, [])
+            try:
+                check_file(path)
+                text = path.read_text()
+                values = yaml.safe_load(text)
+            except (BcrlError, OSError, ValueError, yaml.YAMLError):
+                continue  # whoever chooses it will be told
+            if "@package" not in text and isinstance(values, dict):
+                for key in flat(values):
+                    whole = f"{group.replace('/', '.')}.{key}"
+                    found.setdefault(whole, []).append(f"{group}={path.stem}")
+    return found

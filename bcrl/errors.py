@@ -9,6 +9,8 @@ from collections.abc import Iterable
 class BcrlError(Exception):
     """Something the user can put right; the message says what and how."""
 
+    exit_code = 2  # of the command: bad input, or no place to write
+
 
 class ConfigError(BcrlError):
     """A refused configuration value: names the key, the value and what is allowed."""
@@ -30,7 +32,18 @@ def at_least(key: str, value: int | None, least: int) -> None:
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """`did you mean maze?`, with the known words listed as long as they are few."""
     known = sorted(known)
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    guess = f"did you mean {close[0]}?" if close else ""
+    close = guess(word, known)
     listed = f"known: {', '.join(known)}" if len(known) <= 12 or not close else ""
-    return f"{guess} ({listed})" if guess and listed else guess or listed
+    return f"{close} ({listed})" if close and listed else close or listed
+
+
+def guess(word: str, known: Iterable[str]) -> str:
+    """`did you mean maze?`, or nothing where no known word is like it."""
+    close = closest(word, known)
+    return f"did you mean {close}?" if close else ""
+
+
+def closest(word: str, known: Iterable[str]) -> str | None:
+    """The known word that is most like `word`, if one is like it at all."""
+    found = difflib.get_close_matches(word, sorted(known), n=1, cutoff=0.5)
+    return found[0] if found else None

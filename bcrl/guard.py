@@ -15,6 +15,7 @@ from hydra._internal.core_plugins.importlib_resources_config_source import (
     ImportlibResourcesConfigSource,
 )
 from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.object_type import ObjectType
 from hydra.core.plugins import Plugins
 from hydra.errors import CompactHydraException
 from hydra.plugins.config_source import ConfigResult
@@ -54,6 +55,10 @@ class Packages(ImportlibResourcesConfigSource):
 class Loader(ConfigLoaderImpl):
     """Composes as Hydra does, and lets nothing out that `safety.check` refuses."""
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._repositories: dict[tuple, Any] = {}
+
     def load_configuration(self, *args: Any, **kwargs: Any) -> DictConfig:
         composed = super().load_configuration(*args, **kwargs)
         try:
@@ -61,6 +66,22 @@ class Loader(ConfigLoaderImpl):
         except BcrlError as error:
             raise Refused(str(error)) from error
         return composed
+
+    def get_group_options(
+        self,
+        group_name: str,
+        results_filter: ObjectType | None = ObjectType.CONFIG,
+        config_name: str | None = None,
+        overrides: list[str] | None = None,
+    ) -> list[str]:
+        """As Hydra's, which reads the configs anew for each group that Tab asks for."""
+        asked = (config_name, tuple(overrides or ()))
+        if asked not in self._repositories:
+            found = self._parse_overrides_and_create_caching_repo(
+                config_name, overrides or []
+            )
+            self._repositories[asked] = found[1]
+        return self._repositories[asked].get_group_options(group_name, results_filter)
 
 
 def register() -> None:

@@ -96,6 +96,21 @@ def seed_lock(folder: Path, seed: int) -> Lock:
     return Lock(folder, f"{SEED}{seed:04d}")
 
 
+def is_held(folder: Path, seed: int) -> bool:
+    """Whether a process is computing this seed; nothing is written to find out."""
+    try:
+        handle = os.open(seed_lock(folder, seed).path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        return isinstance(error, BlockingIOError)
+    finally:
+        os.close(handle)
+    return False
+
+
 @contextlib.contextmanager
 def claimed(folder: Path, seeds: Sequence[int]) -> Iterator[dict[int, Lock]]:
     """The locks of those of the seeds that no other process has, for a while."""

@@ -77,7 +77,7 @@ def seed_path(directory: Path, seed: int, suffix: str) -> Path:
 
 def is_complete(directory: Path, seed: int) -> bool:
     """Whether this seed's metadata, written last, says that all of it is there."""
-    facts = _facts(directory, seed)
+    facts = read_facts(directory, seed)
     complete = (facts.get("status"), facts.get("schema")) == ("complete", SCHEMA)
     files = [seed_path(directory, seed, suffix) for suffix in ("csv", "npz")]
     return complete and all(file.exists() for file in files)
@@ -97,14 +97,14 @@ def write_status(plan: Plan, seed: int, status: str, facts: Plain) -> None:
         "env": plan.env,
         "variant": plan.variant,
         "tag": plan.tag,
-        "asked": _ranges(plan.seeds),
+        "asked": ranges(plan.seeds),
         **facts,
         "config": config,
     }
     write_text(seed_path(plan.directory, seed, "json"), sealed(metadata))
 
 
-def _ranges(seeds: Sequence[int]) -> list[list[int]]:
+def ranges(seeds: Sequence[int]) -> list[list[int]]:
     """Seeds as [first, last] of each run of successive ones."""
     ranges: list[list[int]] = []
     for seed in sorted(seeds):
@@ -145,7 +145,7 @@ def closing_table(plans: Sequence[Plan], seconds: float) -> str:
     head = f"{'':32}{'seeds':>7}{'failed':>8}{'CPU s a seed':>14}{'core min':>10}"
     lines, total, peak = [head], 0.0, 0.0
     for plan in plans:
-        facts = [_facts(plan.directory, seed) for seed in plan.seeds]
+        facts = [read_facts(plan.directory, seed) for seed in plan.seeds]
         spent = [fact["cpu_seconds"] for fact in facts if "cpu_seconds" in fact]
         failed = sum(fact.get("status") != "complete" for fact in facts)
         total += sum(spent)
@@ -163,7 +163,7 @@ def closing_table(plans: Sequence[Plan], seconds: float) -> str:
     return "\n".join(lines)
 
 
-def _facts(directory: Path, seed: int) -> Plain:
+def read_facts(directory: Path, seed: int) -> Plain:
     """A seed's metadata, nothing if it has none."""
     try:
         facts = json.loads(seed_path(directory, seed, "json").read_text())
@@ -181,10 +181,7 @@ def provenance() -> dict[str, Any]:
             "python": platform.python_version(),
             **{name: version(name) for name in LIBRARIES},
         },
-        "git": {
-            "revision": _git("rev-parse", "HEAD"),
-            "dirty": _git("status", "--porcelain") not in ("", None),
-        },
+        "git": _revision(),
         "machine": {
             "system": platform.platform(),
             "processor": _processor(),
@@ -193,8 +190,19 @@ def provenance() -> dict[str, Any]:
     }
 
 
+def _revision() -> dict[str, Any]:
+    """The git revision of the checkout that this package is part of, if it is of one.
+
+    An installed package may lie in somebody else's.
+    """
+    if _git("ls-files", "--error-unmatch", "__init__.py") is None:
+        return {"revision": None, "dirty": False}
+    dirty = _git("status", "--porcelain") not in ("", None)
+    return {"revision": _git("rev-parse", "HEAD"), "dirty": dirty}
+
+
 def _git(*arguments: str) -> str | None:
-    """What git says of the checkout this package lies in; None if it is not in one."""
+    """What git says in this package's folder; None if it has nothing to say."""
     here = Path(__file__).resolve().parent
     try:
         done = subprocess.run(

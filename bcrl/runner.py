@@ -36,6 +36,8 @@ Failures = dict[Path, Failed]  # by the plan's directory
 class SeedsFailed(BcrlError):
     """Some seeds failed, all others are complete: which, why, and what reruns them."""
 
+    exit_code = 1
+
 
 def run(*plans: Plan) -> None:
     """Compute and record every seed of the plans that is not complete yet.
@@ -227,7 +229,7 @@ def told(failed: Failures) -> str:
     lines = [f"{seeds} failed, what else was asked for is complete:"]
     for lost in failed.values():
         reasons: dict[str, list[int]] = {}
-        for seed, why in lost.why.items():
+        for seed, why in sorted(lost.why.items()):
             reasons.setdefault(why, []).append(seed)
         for why, seeds in reasons.items():
             name = f"{lost.plan.env} {lost.plan.name}"

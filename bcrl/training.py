@@ -13,6 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from bcrl import checkpoints, records
 from bcrl.compose import Plan
 from bcrl.errors import BcrlError
@@ -86,8 +88,10 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> Outcome:
             mine, busy, resumes = _share(job, held)
             if not mine:
                 return Outcome(busy=busy)
+            strict = "raise" if plan.config["strict"] else "warn"
             try:
-                outcome = _train(job, mine, resumes, held, tick, stop)
+                with np.errstate(divide=strict, over=strict, invalid=strict):
+                    outcome = _train(job, mine, resumes, held, tick, stop)
             except Exception as error:
                 _note_failure(plan, mine, error)
                 raise
@@ -141,13 +145,13 @@ def _train(
     for seed in new:
         records.write_status(plan, seed, "running", host)
 
-    def save() -> None:
+    def save(share: float) -> None:
         clock.note()
         # Rows are many small values, packed at once.
         rest = vars(session) | {"rows": json.dumps(session.rows)}
         content = {"past": course.past, "session": rest, "kept": probe.kept}
         _check_locks(plan, held)
-        checkpoints.save(plan, seeds, content, course.given)
+        checkpoints.save(plan, seeds, share, content, course.given)
 
     saved = time.monotonic()
     for now in course:
@@ -160,10 +164,10 @@ def _train(
             break
         if stop.asked:
             session.interruptions += 1
-            save()
+            save(now.count / plan.length)
             return Outcome(interrupted=True)
         if ends or time.monotonic() - saved >= plan.config["checkpoint_every"]:
-            save()
+            save(now.count / plan.length)
             saved = time.monotonic()
     clock.note()
     failed = _record(job, seeds, new, probe, session, held)

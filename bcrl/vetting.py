@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from bcrl import compose
 from bcrl.compose import Plan
 from bcrl.composed import CONF, CONFIG_NAME, Folders, composed
-from bcrl.errors import BcrlError, did_you_mean
+from bcrl.errors import BcrlError, did_you_mean, guess
 from bcrl.identity import Plain, differences
 from bcrl.sweeps import experiments, first_lines, over_experiments, parse, product
 
@@ -30,6 +30,8 @@ RELEASED_OPTIONS = {
 }
 #: The env that a command completes by an id, after which its results are named.
 OPEN = "gymnasium"
+#: Groups that Hydra would take any option of, there or not: their default need not be.
+OPTIONAL = ("budget", "local")
 #: Hydra's own keys that matter in running jobs.
 RUNNING = (
     *("launcher", "callbacks", "output_subdir", "run", "sweep"),
@@ -91,7 +93,9 @@ def _composed(arguments: Namespace) -> tuple[Folders, list[DictConfig]]:
     if arguments.config_dir:
         folder = Path(arguments.config_dir).absolute()
         if not folder.is_dir():
-            raise BcrlError(f"--config-dir: there is no folder {folder}")
+            close = guess(folder.name, [path.name for path in folder.parent.glob("*/")])
+            text = f"--config-dir: there is no folder {folder}"
+            raise BcrlError(f"{text}; {close}" if close else text)
         folders = (str(folder),)
     searchpath = [o for o in parsed if o.key_or_group == "hydra.searchpath"]
     parsed = [o for o in parsed if o not in searchpath]
@@ -131,27 +135,31 @@ def _refuse_nonsense(
             raise BcrlError(f"{key}: follows from the other choices; override its keys")
         value = override.value()
         named = isinstance(value, (str, Sweep))
-        if key in (*VARIANT_GROUPS, "variant", "budget") and not named:
+        if key in (*VARIANT_GROUPS, *OPTIONAL, "variant") and not named:
             text = f"{override.input_line}: name an option, or leave {key} out"
+            raise BcrlError(text)
+        group = key.replace(".", "/")
+        if group != key and isinstance(value, str) and Path(CONF, group).is_dir():
+            text = f"{override.input_line}: an option is chosen by {group}={value}"
             raise BcrlError(text)
         if key == "experiment" and isinstance(value, list):
             raise BcrlError("experiment: one at a time, or -m experiment=fig1,fig2")
-        if key == "budget":
+        if key in OPTIONAL:
             swept = override.is_sweep_override()
-            _check_budgets(
-                override.sweep_string_iterator() if swept else [value], folders
+            _check_options(
+                key, override.sweep_string_iterator() if swept else [value], folders
             )
     if arguments.multirun and getattr(arguments, "cfg", None):
         raise BcrlError("--cfg shows one composition; drop -m and the sweep")
 
 
-def _check_budgets(names: Iterable[object], folders: Folders) -> None:
-    """Raise BcrlError for a budget that no folder has: the group itself is optional."""
-    places = [Path(folder, "budget") for folder in (CONF, *folders)]
+def _check_options(group: str, names: Iterable[object], folders: Folders) -> None:
+    """Raise BcrlError for an option that no folder has."""
+    places = [Path(folder, group) for folder in (CONF, *folders)]
     known = {path.stem for place in places for path in place.glob("*.yaml")}
     for name in map(str, names):
         if name not in known:
-            raise BcrlError(f"budget={name}: {did_you_mean(name, known)}")
+            raise BcrlError(f"{group}={name}: {did_you_mean(name, known)}")
 
 
 def plan(job: DictConfig, hydra: DictConfig, folders: Sequence[str]) -> Plan:
@@ -168,7 +176,7 @@ def plan(job: DictConfig, hydra: DictConfig, folders: Sequence[str]) -> Plan:
         env = str(config["env"]["id"]).rpartition(":")[2].replace("/", "-")
     for tag, released in ((None, False), (RELEASED, True)):
         usual = _usual(config, choices, released)
-        variant = (f"env={choices['env']}", *named, *usual)
+        variant = (f"env={choices['env']}", "local=none", *named, *usual)
         known[tag] = _plain(composed(CONFIG_NAME, variant, extra))
         if not differences(config, known[tag]):
             break

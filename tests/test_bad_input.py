@@ -1,8 +1,12 @@
 """Bad input ends in one clear message before any work, and leaves nothing behind."""
 
+import re
+
 import pytest
 
+from bcrl.composed import CONF
 from bcrl.errors import BcrlError
+from bcrl.safety import check_name
 from tests.conftest import plans
 
 MAZE = "env=maze"
@@ -17,6 +21,25 @@ BAD = {
     "added key": (
         [MAZE, "+env.hieght=0.5"],
         ["env.hieght=0.5", "unknown key", "height"],
+    ),
+    "another option's key": (
+        [MAZE, "transfer.nu=0.9"],
+        ["transfer.nu: unknown key; transfer=policy_reuse would have it"],
+    ),
+    "nearly another option's key": (
+        [MAZE, "algorithm.lspi.iterrations=1"],
+        ["did you mean algorithm.lspi.iterations, with algorithm=dqn?"],
+    ),
+    "another regressor's key": (
+        [MAZE, "algorithm/regressor=tabular", "algorithm.regressor.trees=9"],
+        ["algorithm/regressor=forest", "would have it"],
+    ),
+    "a group's typo": ([MAZE, "algorithm/regresor=forest"], ["algorithm/regressor?"]),
+    "unknown experiment": (["experiment=fgi1"], ["did you mean fig1?"]),
+    "unknown local": ([MAZE, "local=hoem"], ["local=hoem", "none"]),
+    "an option with a dot": (
+        [MAZE, "algorithm.regressor=tabular"],
+        ["chosen by algorithm/regressor=tabular"],
     ),
     "no seeds": ([MAZE, "seeds.count=0"], ["seeds.count=0", "at least 1"]),
     "negative seed": ([MAZE, "seeds.first=-1"], ["seeds.first=-1", "at least 0"]),
@@ -91,6 +114,42 @@ def test_it_is_refused_by_key_value_and_what_is_allowed(case):
         assert words in str(refusal.value)
 
 
+def test_a_folder_is_looked_for_among_its_neighbours(tmp_path):
+    (tmp_path / "my_configs").mkdir()
+    with pytest.raises(BcrlError, match=r"did you mean my_configs\?"):
+        plans(MAZE, config_dir=str(tmp_path / "my_conifgs"))
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["a b", "a;b", "$(x)", "a,b", "a=b", "-x", ".x", "", "é", "a@b", "a*", "a|b", "#a"],
+)
+def test_a_name_that_a_shell_or_a_path_would_take_apart_is_refused(name):
+    with pytest.raises(BcrlError, match=r"tag=.*plain name"):
+        check_name("tag", name)
+
+
+@pytest.mark.parametrize("key", ["tag", "scale.name"])
+def test_whatever_names_a_directory_is_such_a_name(key):
+    with pytest.raises(BcrlError, match=f"{key}=a b: .*plain name"):
+        plans(MAZE, f"{key}='a b'")
+
+
+def test_an_env_is_a_plain_name_too(tmp_path):
+    (tmp_path / "env").mkdir()
+    text = (CONF / "env" / "maze.yaml").read_text()
+    (tmp_path / "env" / "my maze.yaml").write_text(text)
+    with pytest.raises(BcrlError, match="env=my maze: must be a plain name"):
+        plans("env='my maze'", config_dir=str(tmp_path))
+
+
+def test_every_directory_is_one_word_of_a_shell():
+    found = plans("experiment=fig4_released,search_nu", multirun=True)
+    assert len(found) == 3 + 3
+    for made in found:
+        assert re.fullmatch(r"[\w.@-]+(/[\w.@-]+)*", str(made.directory), re.ASCII)
+
+
 YAMLS = {
     "wrong type": ("seeds: {count: many}", ["seeds.count", "many"]),
     "unknown key": ("seeds: {cuont: 3}", ["seeds.cuont"]),
@@ -127,6 +186,7 @@ def test_a_sweep_whose_jobs_would_share_a_directory_is_refused():
         ["env=maze", "runs_dir=a_file/below"],
         ["env=maze", "runs_dir=/proc/runs"],
         ["env=maze", "--config-dir", "nowhere"],
+        ["--mutlirun", "env=maze"],
         ["env=maze", "--experimental-rerun", "x.pickle"],
     ],
 )

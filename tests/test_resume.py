@@ -228,7 +228,7 @@ def test_a_checkpoint_of_other_code_counts_as_absent(tmp_path, monkeypatch):
     p, path = interrupted(tmp_path / "a")
     before = path.stat().st_mtime_ns
     monkeypatch.setattr(checkpoints, "_code", lambda: "another")
-    assert checkpoints.teams(p) == [] and path.stat().st_mtime_ns == before
+    assert checkpoints.teams(p) == {} and path.stat().st_mtime_ns == before
     runner.run(p)  # from the start
     other, _ = interrupted(tmp_path / "b")
     runner.run(other)

@@ -260,16 +260,9 @@ def test_the_command_runs_a_sweep_and_prints_a_line_a_task(bcrl, tmp_path):
     assert made == ["C-FQI@t", "FQI@t"]
 
 
-def test_help_and_cfg_teach(bcrl, tmp_path):
+def test_cfg_shows_a_composition_and_help_needs_none(bcrl, tmp_path):
     shown = bcrl("--help")
-    assert shown.returncode == 0
-    for words in (
-        "Usage: bcrl",
-        "curriculum: off, on",
-        "experiment=fig1",
-        "seeds.first",
-    ):
-        assert words in shown.stdout
+    assert shown.returncode == 0 and "bcrl GROUP=OPTION" in shown.stdout
     composed = bcrl("env=maze", "--cfg", "job")
     assert composed.returncode == 0 and "height" in composed.stdout
     assert not list(tmp_path.iterdir())

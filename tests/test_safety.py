@@ -260,7 +260,7 @@ def test_a_file_that_is_not_utf8_or_leads_in_circles_is_refused(refused, tmp_pat
 
 
 @pytest.mark.parametrize(
-    "shown", [[], ["--help"], ["--info"], ["--cfg", "all"], ["--info", "defaults"]]
+    "shown", [[], ["--info"], ["--cfg", "all"], ["--info", "defaults"], ["--dry-run"]]
 )
 def test_a_primary_config_of_ones_own_is_checked_whatever_is_asked(
     shown, refused, tmp_path
@@ -283,7 +283,7 @@ def test_completion_reads_no_package_and_no_bomb(refused, tmp_path, monkeypatch)
         refused("-sc", "query=bash")
 
 
-@pytest.mark.parametrize("arguments", [["--help", "env=maz"], ["-sc", "install=sh"]])
+@pytest.mark.parametrize("arguments", [["--cfg=job", "env=maz"], ["-sc", "install=sh"]])
 def test_showing_something_ends_in_a_message_too(arguments, refused):
     refused(*arguments)
 
@@ -306,7 +306,7 @@ def test_the_command_itself_runs_nothing_of_a_malicious_config(bcrl, tmp_path):
     option = own(tmp_path, YAMLS["a callback"].replace("touch x", "touch canary"))
     for arguments in (
         [MAZE, "experiment=mine", option],
-        [MAZE, "experiment=mine", option, "--help"],
+        [MAZE, "experiment=mine", option, "--cfg=job"],
         ["-m", MAZE, "curriculum=on,off", "hydra.launcher._target_=os.system"],
         [MAZE, *BAD["given twice"]],
         [MAZE, "tag=\udcff"],
