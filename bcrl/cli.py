@@ -7,10 +7,11 @@ from argparse import Namespace
 
 import hydra
 from hydra._internal.utils import get_args_parser
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from bcrl import guard, records, runner, vetting
+from bcrl import guard, launching, records, runner, vetting
 from bcrl.compose import Plan
 from bcrl.errors import BcrlError
 from bcrl.files import make_directory
@@ -19,12 +20,12 @@ from bcrl.terminal import say
 
 #: Exit codes, besides 0: seeds failed; bad input or no place to write; a signal.
 FAILED, REFUSED, INTERRUPTED = 1, 2, EXIT_CODE
-_failures: list[int] = []  # exit codes of jobs that Hydra runs, which go on to the next
 
 
 def main() -> None:
     """Console entry point; refuses bad input with one message before any work."""
     guard.register()
+    launching.register()
     arguments = get_args_parser().parse_intermixed_args()
     # Hydra wants the options before the overrides; people write them anywhere.
     options = [a for a in sys.argv[1:] if a not in arguments.overrides]
@@ -32,11 +33,15 @@ def main() -> None:
     try:
         with guard.refusals():
             plans = _vet(arguments)
-            if not plans or vetting.left_to_hydra(arguments):
-                _run_job()
-                sys.exit(max(_failures, default=0))
-            make_directory(plans[0].root, "runs_dir")
-        runner.run(*plans)
+            by_hydra = not plans or vetting.left_to_hydra(arguments)
+            if by_hydra:
+                _by_hydra()
+            else:
+                make_directory(plans[0].root, "runs_dir")
+        if by_hydra:
+            runner.check_complete(plans)
+        else:
+            runner.run(*plans)
     except runner.SeedsFailed as error:
         sys.exit(_complain(error, FAILED))
     except BcrlError as error:
@@ -66,21 +71,23 @@ def _vet(arguments: Namespace) -> list[Plan]:
     return plans
 
 
-@hydra.main(
-    version_base="1.3", config_path=str(vetting.CONF), config_name=vetting.CONFIG_NAME
-)
 def _run_job(composed: DictConfig) -> None:
-    """One job of Hydra's: its composed config is planned and run."""
-    own = HydraConfig.get()
-    sources = own.runtime.config_sources
-    folders = [source.path for source in sources if source.schema == "file"]
+    """One job of Hydra's, perhaps in a process of a launcher's: it is planned and run.
+
+    An error is said and no more, for others shall go on; their files tell in the end.
+    """
+    guard.register()
+    GlobalHydra.instance().clear()  # Hydra has composed; vetting does, to compare
     try:
-        runner.run(vetting.plan(composed, own, folders))
+        runner.run(vetting.job(composed, HydraConfig.get()))
     except BcrlError as error:
-        if not own.launcher["_target_"].endswith("BasicLauncher"):
-            raise  # in a process of the launcher's: it tells Hydra
-        failed = isinstance(error, runner.SeedsFailed)
-        _failures.append(_complain(error, FAILED if failed else REFUSED))
+        say(f"bcrl: {error}")
+
+
+#: Not a decorator: a process of a launcher's looks for the plain function by its name.
+_by_hydra = hydra.main(
+    version_base="1.3", config_path=str(vetting.CONF), config_name=vetting.CONFIG_NAME
+)(_run_job)
 
 
 def _complain(error: BcrlError, code: int) -> int:

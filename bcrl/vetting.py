@@ -13,7 +13,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bcrl import compose
+from bcrl import compose, safety
 from bcrl.compose import Plan
 from bcrl.composed import CONF, CONFIG_NAME, Folders, composed
 from bcrl.errors import BcrlError, did_you_mean
@@ -51,7 +51,8 @@ def _command(hydra: DictConfig) -> str:
     words = ["bcrl", *hydra.overrides.task, *asked]
     if hydra.job.config_name != CONFIG_NAME:
         words += ["--config-name", hydra.job.config_name]
-    if hydra.runtime.choices.get("experiment"):
+    basic = hydra.launcher["_target_"] == safety.ALLOWED["launcher"][0]
+    if hydra.runtime.choices.get("experiment") and basic:
         words.append("hydra.mode=RUN")  # this job of its sweep, not all
     return shlex.join(words)
 
@@ -152,6 +153,13 @@ def _check_budgets(names: Iterable[object], folders: Folders) -> None:
     for name in map(str, names):
         if name not in known:
             raise BcrlError(f"budget={name}: {did_you_mean(name, known)}")
+
+
+def job(config: DictConfig, hydra: DictConfig) -> Plan:
+    """The plan of one of the jobs that Hydra runs, given Hydra's part of its config."""
+    sources = hydra.runtime.config_sources
+    folders = [source.path for source in sources if source.schema == "file"]
+    return plan(config, hydra, folders)
 
 
 def plan(job: DictConfig, hydra: DictConfig, folders: Sequence[str]) -> Plan:
