@@ -110,7 +110,9 @@ class Slurm(SlurmLauncher):
         )
         # Since Slurm 22.05 a step has one core unless it says how many.
         srun = [f"--cpus-per-task={self.params['cpus_per_task']}"]
-        executor.update_parameters(**params, slurm_srun_args=srun)
+        more = {"requeue": True}  # also after a node's failure
+        params |= {"slurm_srun_args": srun, "slurm_additional_parameters": more}
+        executor.update_parameters(**params)
         with guard.unregistered():
             state = Singleton.get_state()
         rows = [(job, "hydra.sweep.dir", n, "", state) for n, job in enumerate(jobs)]
@@ -120,7 +122,8 @@ class Slurm(SlurmLauncher):
             submitted = executor.map_array(self, *columns)
             arrays.append(submitted[0].job_id.partition("_")[0])
         if arrays:
-            say(f"Slurm: {len(jobs)} jobs as {' '.join(arrays)}; their logs: {folder}")
+            count = f"{len(jobs)} job{'s' * (len(jobs) > 1)}"
+            say(f"Slurm: {count} as {' '.join(arrays)}; logs in {folder}")
             _wait(arrays, self.config.progress != "none")
         return []
 
@@ -132,7 +135,9 @@ class Slurm(SlurmLauncher):
             return super().__call__(*arguments)
         except Interrupted:
             own = f"--jobs={os.environ['SLURM_JOB_ID']}"
-            if _squeue(own, "--format=%T") == "RUNNING":  # and not ended by somebody
+            now = _squeue(own, "--format=%T %r") or ""
+            # Not where somebody has ended it, or Slurm puts it back by itself.
+            if now.startswith("RUNNING") or now.endswith("TimeLimit"):
                 usual = f"SIG{submitit.JobEnvironment.USR_SIG}"
                 signal.raise_signal(signal.Signals[usual])  # submitit puts it back
             sys.exit(EXIT_CODE)
@@ -150,11 +155,11 @@ def _wait(arrays: Sequence[str], telling: bool) -> None:
                 if not states:
                     return
                 now = ", ".join(f"{n} {s.lower()}" for s, n in sorted(states.items()))
+                pause = 1.0 if now != before else min(30.0, 1.2 * pause)
                 if telling and now != before:
                     say(f"Slurm: {now}")
                 before = now
             time.sleep(pause)
-            pause = min(30.0, 1.2 * pause)
     say(f"bcrl: Slurm goes on with it; `scancel {' '.join(arrays)}` ends it")
     raise Interrupted
 

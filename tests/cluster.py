@@ -49,7 +49,7 @@ SwitchType=switch/none
 JobRequeue=1
 KillWait=10
 ReturnToService=2
-NodeName={host} NodeAddr=127.0.0.1 CPUs={cores} State=UNKNOWN
+NodeName={host} NodeAddr=127.0.0.1 CPUs={cores} RealMemory={memory} State=UNKNOWN
 PartitionName=main Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 """
 
@@ -72,8 +72,9 @@ def running(seconds: float = 30.0) -> Iterator[dict[str, str]]:
         (folder / name).mkdir(mode=0o755)
     conf, key = folder / "slurm.conf", folder / "munge.key"
     host = socket.gethostname().partition(".")[0]
-    about = {"host": host, "user": getpass.getuser(), "cores": os.cpu_count()}
-    conf.write_text(CONF.format(folder=folder, ports=_free_ports(2), **about))
+    machine = {"host": host, "user": getpass.getuser(), "cores": os.cpu_count()}
+    machine["memory"] = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") >> 20
+    conf.write_text(CONF.format(folder=folder, ports=_free_ports(2), **machine))
     key.touch(mode=0o600)
     key.write_bytes(secrets.token_bytes(128))
     environment = {**os.environ, "SLURM_CONF": str(conf), "PATH": SBIN}
