@@ -71,17 +71,20 @@ def _vet(arguments: Namespace) -> list[Plan]:
     return plans
 
 
-def _run_job(composed: DictConfig) -> None:
-    """One job of Hydra's, perhaps in a process of a launcher's: it is planned and run.
+def _run_job(composed: DictConfig) -> int:
+    """One job of Hydra's, perhaps in a process of a launcher's; its exit code.
 
-    An error is said and no more, for others shall go on; their files tell in the end.
+    An error is said and no more: other jobs go on, and in the end their files tell.
     """
     guard.register()
     GlobalHydra.instance().clear()  # Hydra has composed; vetting does, to compare
     try:
         runner.run(vetting.job(composed, HydraConfig.get()))
+    except runner.SeedsFailed as error:
+        return _complain(error, FAILED)
     except BcrlError as error:
-        say(f"bcrl: {error}")
+        return _complain(error, REFUSED)
+    return 0
 
 
 #: Not a decorator: a process of a launcher's looks for the plain function by its name.

@@ -18,7 +18,7 @@ from concurrent.futures import BrokenExecutor
 from dataclasses import replace
 from functools import partial
 from multiprocessing import active_children
-from typing import Any
+from typing import Any, NoReturn
 
 from hydra.core.plugins import Plugins
 from hydra.core.singleton import Singleton
@@ -26,9 +26,10 @@ from hydra_plugins.hydra_joblib_launcher.joblib_launcher import JoblibLauncher
 from hydra_plugins.hydra_submitit_launcher.submitit_launcher import SlurmLauncher
 from omegaconf import DictConfig
 
-from bcrl import compose, guard, records, runner, vetting
+from bcrl import compose, guard, records, vetting
 from bcrl.interrupts import EXIT_CODE, Interrupted, Stop
 from bcrl.terminal import say
+from bcrl.workers import cores
 
 ARRAY = 1000  # jobs of one array: Slurm's MaxArraySize is 1001 unless a site says more
 Jobs = Sequence[Sequence[str]]  # each one's overrides
@@ -47,11 +48,11 @@ class Local(JoblibLauncher):
         jobs = _divided(self, job_overrides, self.seeds_per_job)
         if not jobs:
             return []
-        cores = max(1, runner.cores() // self.config.workers)
-        at_once = min(self.joblib["n_jobs"] or cores, len(jobs))
+        each = max(1, cores() // self.config.workers)
+        at_once = min(self.joblib["n_jobs"] or each, len(jobs))
         self.joblib["n_jobs"] = at_once
         if self.config.threads is None:
-            jobs = [[*job, f"threads={max(1, cores // at_once)}"] for job in jobs]
+            jobs = [[*job, f"threads={max(1, each // at_once)}"] for job in jobs]
         self.task_function = partial(_unless_stopped, self.task_function)
         stop = _PassedOn()
         with stop.on_signals(second_ends_all=True), guard.unregistered():
@@ -127,12 +128,12 @@ class Slurm(SlurmLauncher):
             _wait(arrays, self.config.progress != "none")
         return []
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: Any) -> NoReturn:
         import submitit
 
         sys.argv = self.argv  # a result says which command it comes from
         try:
-            return super().__call__(*arguments)
+            code = super().__call__(*arguments).return_value
         except Interrupted:
             own = f"--jobs={os.environ['SLURM_JOB_ID']}"
             now = _squeue(own, "--format=%T %r") or ""
@@ -140,7 +141,8 @@ class Slurm(SlurmLauncher):
             if now.startswith("RUNNING") or now.endswith("TimeLimit"):
                 usual = f"SIG{submitit.JobEnvironment.USR_SIG}"
                 signal.raise_signal(signal.Signals[usual])  # submitit puts it back
-            sys.exit(EXIT_CODE)
+            code = EXIT_CODE
+        sys.exit(code)  # nobody waits for a result
 
 
 def _wait(arrays: Sequence[str], telling: bool) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,7 +16,7 @@ from bcrl.envs import Env
 from bcrl.errors import BcrlError
 from bcrl.interrupts import Interrupted, Stop
 from bcrl.terminal import say
-from bcrl.workers import Died, each
+from bcrl.workers import Died, cores, each
 
 Seeds = tuple[int, ...]
 
@@ -257,11 +256,3 @@ def told(failed: Failures) -> str:
     for lost in failed.values():
         lines += [f"  {command}" for command in lost.plan.command.splitlines()]
     return "\n".join(lines)
-
-
-def cores() -> int:
-    """Cores that this process may use; not every Slurm binds a job to its own."""
-    there = os.cpu_count() or 1
-    if hasattr(os, "sched_getaffinity"):
-        there = len(os.sched_getaffinity(0))
-    return min(there, int(os.environ.get("SLURM_CPUS_PER_TASK", there)))
