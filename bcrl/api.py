@@ -30,7 +30,6 @@ from bcrl.learners.fqi import FQI
 from bcrl.q.regressors import ForestRegressor as Forest
 from bcrl.q.regressors import Tabular
 from bcrl.q.scikit import Sklearn
-from bcrl.runner import cores
 from bcrl.stage import Course, Learner, Snapshot, Stage, Team, snapshots
 from bcrl.transfer import (
     Boost,
@@ -41,6 +40,7 @@ from bcrl.transfer import (
     hands_on_a_policy,
     warm_start,
 )
+from bcrl.workers import cores
 
 __all__ = [
     "DQN",

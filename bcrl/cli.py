@@ -10,6 +10,7 @@ from argparse import Namespace
 from typing import TYPE_CHECKING
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
@@ -22,8 +23,6 @@ from bcrl.terminal import say, show
 
 if TYPE_CHECKING:
     from bcrl.compose import Plan
-
-_failures: list[int] = []  # exit codes of jobs that Hydra runs, which go on to the next
 
 
 def main() -> None:
@@ -56,7 +55,8 @@ def _vet(arguments: Namespace) -> list[Plan]:
     if arguments.config_path:
         raise BcrlError("--config-path: add a folder of your own with --config-dir")
     if arguments.hydra_help or arguments.shell_completion:
-        return _leave_to_hydra()
+        _by_hydra()
+        return []
     from bcrl import overview, records, vetting
 
     if arguments.status:
@@ -69,31 +69,39 @@ def _vet(arguments: Namespace) -> list[Plan]:
     if arguments.dry_run:
         show(overview.dry_run(plans))
         return []
-    if arguments.cfg or arguments.info or vetting.left_to_hydra(arguments):
-        return _leave_to_hydra()
+    if arguments.cfg or arguments.info:
+        _by_hydra()
+        return []
+    if vetting.left_to_hydra(arguments):
+        from bcrl import launching, runner
+
+        launching.register()
+        _by_hydra()
+        runner.check_complete(plans)
+        return []
     return plans
 
 
-def _leave_to_hydra() -> list[Plan]:
-    """Hydra shows something, or runs the jobs one by one."""
-    _run_job()
-    sys.exit(max(_failures, default=0))
+def _run_job(composed: DictConfig) -> int:
+    """One job of Hydra's, perhaps in a process of a launcher's; its exit code.
 
-
-@hydra.main(version_base="1.3", config_path=str(CONF), config_name=CONFIG_NAME)
-def _run_job(composed: DictConfig) -> None:
-    """One job of Hydra's: its composed config is planned and run."""
+    An error is said and no more: other jobs go on, and in the end their files tell.
+    """
     from bcrl import runner, vetting
 
-    own = HydraConfig.get()
-    sources = own.runtime.config_sources
-    folders = [source.path for source in sources if source.schema == "file"]
+    guard.register()
+    GlobalHydra.instance().clear()  # Hydra has composed; vetting does, to compare
     try:
-        runner.run(vetting.plan(composed, own, folders))
+        runner.run(vetting.job(composed, HydraConfig.get()))
     except BcrlError as error:
-        if not own.launcher["_target_"].endswith("BasicLauncher"):
-            raise  # in a process of the launcher's: it tells Hydra
-        _failures.append(_complain(error))
+        return _complain(error)
+    return 0
+
+
+#: Not a decorator: a process of a launcher's looks for the plain function by its name.
+_by_hydra = hydra.main(
+    version_base="1.3", config_path=str(CONF), config_name=CONFIG_NAME
+)(_run_job)
 
 
 def _complain(error: BcrlError) -> int:

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,7 @@ class Plan:
     stages: tuple[Stage, ...]
     tasks: tuple[Env, ...]  # easiest first, the target last
     metrics: tuple[str, ...]
+    asked: tuple[int, ...]  # all seeds, of which these may be a part:
     seeds: tuple[int, ...]
     lockstep: int
     device: str
@@ -89,6 +91,7 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
     same = [tag for tag, changed in differing.items() if not changed]
     tag = same[0] if same else _short_hash(differing[None])
     lockstep = config["seeds"]["lockstep"]
+    asked = tuple(config["seeds"]["first"] + i for i in range(config["seeds"]["count"]))
     return Plan(
         env=env,
         variant=_variant(name, chosen),
@@ -97,13 +100,25 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
         stages=stages,
         tasks=tuple(tasks),
         metrics=metrics,
-        seeds=tuple(
-            config["seeds"]["first"] + i for i in range(config["seeds"]["count"])
-        ),
+        asked=asked,
+        seeds=part(asked, config["seeds"]["part"]),
         lockstep=lockstep or chosen_algorithm.LOCKSTEP,
         device=_device(config["device"], chosen_algorithm.FAMILY),
         config=config,
     )
+
+
+def part(seeds: tuple[int, ...], which: str | None) -> tuple[int, ...]:
+    """The part of the seeds that `which` names, "2/5"; all of them if it is None."""
+    if which is None:
+        return seeds
+    found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", which, re.ASCII)
+    number, parts = map(int, found.groups()) if found else (0, 0)
+    if not 1 <= number <= parts <= len(seeds):
+        why = f"must be K/N, the K-th of at most {len(seeds)} parts, such as 1/2"
+        raise ConfigError("seeds.part", which, why)
+    first, after = ((k * len(seeds)) // parts for k in (number - 1, number))
+    return seeds[first:after]
 
 
 def _variant(algorithm_name: str, chosen: Composition) -> str:

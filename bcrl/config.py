@@ -19,6 +19,7 @@ class Seeds:
     first: int = 0
     count: int = 3
     lockstep: int | None = None  # seeds that train together; null: the algorithm's
+    part: str | None = None  # "2/5": the second of five parts of them; null: all
 
 
 @dataclass

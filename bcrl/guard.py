@@ -52,6 +52,9 @@ class Packages(ImportlibResourcesConfigSource):
         super().__init__(provider, path)
 
 
+OURS = {"file": Files, "pkg": Packages}  # by the kind of place, as Hydra has them
+
+
 class Loader(ConfigLoaderImpl):
     """Composes as Hydra does, and lets nothing out that `safety.check` refuses."""
 
@@ -88,8 +91,20 @@ def register() -> None:
     """Make the schema known to Hydra, and let it read and compose by these classes."""
     config.register()
     Plugins.instance()  # registers Hydra's own
-    SourcesRegistry.instance().types |= {"file": Files, "pkg": Packages}
+    SourcesRegistry.instance().types |= OURS
     hydra_internals.ConfigLoaderImpl = Loader
+
+
+@contextmanager
+def unregistered() -> Iterator[None]:
+    """Meanwhile Hydra is as a launcher's processes want it, which register anew."""
+    types = SourcesRegistry.instance().types
+    for kind in OURS:
+        del types[kind]
+    try:
+        yield
+    finally:
+        types |= OURS
 
 
 @contextmanager

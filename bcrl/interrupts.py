@@ -35,7 +35,7 @@ class Stop:
 
     @contextlib.contextmanager
     def on_signals(self, second_ends_all: bool) -> Iterator[None]:
-        """Meanwhile signals only ask; a second one may end the process at once.
+        """Meanwhile signals only ask; one that comes again may end the process at once.
 
         Those that are ignored (as by nohup) stay so.
         """
@@ -43,8 +43,10 @@ class Stop:
             yield  # whose thread it is gets the signals
             return
 
+        came = set()  # a scheduler may send two kinds, one soon after the other
+
         def note(number: int, frame: FrameType | None) -> None:
-            if self.asked and second_ends_all:
+            if number in came and second_ends_all:
                 signal.signal(number, signal.SIG_DFL)
                 os.kill(os.getpid(), number)
             if not self.asked and second_ends_all:
@@ -53,6 +55,7 @@ class Stop:
                 text = f"bcrl: {name}: saving; once more to quit at once\n"
                 with contextlib.suppress(*GONE):
                     os.write(sys.__stderr__.fileno(), text.encode())
+            came.add(number)
             self.ask()
 
         heard = [n for n in SIGNALS if signal.getsignal(n) is not signal.SIG_IGN]

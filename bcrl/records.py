@@ -83,6 +83,11 @@ def is_complete(directory: Path, seed: int) -> bool:
     return complete and all(file.exists() for file in files)
 
 
+def status(plan: Plan, seed: int) -> str | None:
+    """What a seed's JSON says: `running`, `complete` or `failed: why`; None without."""
+    return read_facts(plan.directory, seed).get("status")
+
+
 def write_status(plan: Plan, seed: int, status: str, facts: Plain) -> None:
     """One seed's JSON: `status` (`running`, `complete` or `failed: why`), and `facts`.
 
@@ -97,7 +102,7 @@ def write_status(plan: Plan, seed: int, status: str, facts: Plain) -> None:
         "env": plan.env,
         "variant": plan.variant,
         "tag": plan.tag,
-        "asked": ranges(plan.seeds),
+        "asked": ranges(plan.asked),
         **facts,
         "config": config,
     }

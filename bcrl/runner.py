@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,7 +16,7 @@ from bcrl.envs import Env
 from bcrl.errors import BcrlError
 from bcrl.interrupts import Interrupted, Stop
 from bcrl.terminal import say
-from bcrl.workers import Died, each
+from bcrl.workers import Died, cores, each
 
 Seeds = tuple[int, ...]
 
@@ -71,9 +70,11 @@ def merged(plans: Sequence[Plan]) -> Iterator[Plan]:
     for plan in plans:
         before = together.get(plan.directory, plan)
         seeds = tuple(dict.fromkeys(before.seeds + plan.seeds))
+        asked = tuple(dict.fromkeys(before.asked + plan.asked))
         commands = dict.fromkeys([*before.command.splitlines(), plan.command])
         command = "\n".join(commands)
-        together[plan.directory] = replace(before, seeds=seeds, command=command)
+        whole = replace(before, asked=asked, seeds=seeds, command=command)
+        together[plan.directory] = whole
     yield from together.values()
 
 
@@ -108,6 +109,25 @@ def ordered(plans: Sequence[Plan], failed: Failures) -> list[tuple[Plan, Seeds]]
         for group in _groups(seeds, plan.lockstep, spread)
     ]
     return sorted(work, key=lambda job: -len(job[1]) * costs.expected(job[0]))
+
+
+def check_complete(plans: Sequence[Plan]) -> None:
+    """Raise SeedsFailed, as `run`, for seeds that other processes have left undone."""
+    failed: Failures = {}
+    for plan in merged(plans):
+        why = {seed: _undone(plan, seed) for seed in records.pending(plan)}
+        if why:
+            failed[plan.directory] = Failed(plan, why)
+    if failed:
+        raise SeedsFailed(told(failed))
+
+
+def _undone(plan: Plan, seed: int) -> str:
+    """Why a seed isn't complete, as far as its files tell."""
+    status = records.status(plan, seed) or "never begun"
+    if status == "running":
+        return "begun, but its process is gone or was told to leave"
+    return status.removeprefix("failed: ")
 
 
 def _look_round(plan: Plan) -> None:
@@ -238,10 +258,3 @@ def told(failed: Failures) -> str:
     for lost in failed.values():
         lines += [f"  {command}" for command in lost.plan.command.splitlines()]
     return "\n".join(lines)
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

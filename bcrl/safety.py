@@ -53,7 +53,7 @@ LOG_FILES = (
 STREAMS = ("ext://sys.stdout", "ext://sys.stderr")
 #: Interpolations that can only be text, wherever they lead.
 TEXTUAL = re.compile(
-    r"runs_dir|tag|hydra\.(job\.(name|num|id)|run\.dir|sweep\.(dir|subdir)"
+    r"runs_dir|tag|workers|hydra\.(job\.(name|num|id)|run\.dir|sweep\.(dir|subdir)"
     r"|runtime\.(output_dir|cwd))"
 )
 #: Environment variables that only say how much of a machine is used.

@@ -13,7 +13,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bcrl import compose
+from bcrl import compose, safety
 from bcrl.compose import Plan
 from bcrl.composed import CONF, CONFIG_NAME, Folders, composed
 from bcrl.errors import BcrlError, did_you_mean, guess
@@ -50,23 +50,32 @@ def plans(arguments: Namespace) -> list[Plan]:
 def _command(hydra: DictConfig) -> str:
     """The command that runs one job alone, from Hydra's part of its config."""
     asked = [o for o in hydra.overrides.hydra if not o.startswith("hydra.mode=")]
-    words = ["bcrl", *hydra.overrides.task, *asked]
+    words = ["bcrl", *(["-m"] if _launched(hydra) else [])]
+    words += [*hydra.overrides.task, *asked]
     if hydra.job.config_name != CONFIG_NAME:
         words += ["--config-name", hydra.job.config_name]
-    if hydra.runtime.choices.get("experiment"):
+    if hydra.runtime.choices.get("experiment") and not _launched(hydra):
         words.append("hydra.mode=RUN")  # this job of its sweep, not all
     return shlex.join(words)
+
+
+def _launched(hydra: DictConfig) -> bool:
+    """Whether a launcher gives the jobs to other processes."""
+    return hydra.launcher["_target_"] != safety.ALLOWED["launcher"][0]  # the basic one
 
 
 def left_to_hydra(arguments: Namespace) -> bool:
     """Whether the jobs ask for more of Hydra than composing them.
 
     Then Hydra runs them one by one, or hands them to a launcher. Raises BcrlError for a
-    sweep over experiments, which Hydra can't run.
+    sweep over experiments, which Hydra can't run, and where it would launch nothing.
     """
     usual = _running(composed(CONFIG_NAME, ("env=maze",), ()))
     for job in _composed(arguments)[1]:
         asked = [k for k, value in _running(job).items() if value != usual[k]]
+        sweeps = arguments.multirun or job.hydra.mode == RunMode.MULTIRUN
+        if _launched(job.hydra) and not sweeps:
+            raise BcrlError("hydra/launcher: a sweep's jobs are launched; add -m")
         if asked and any(map(over_experiments, parse(arguments.overrides))):
             text = f"experiment: with hydra.{asked[0]} of your own, one at a time"
             raise BcrlError(text)
@@ -160,6 +169,13 @@ def _check_options(group: str, names: Iterable[object], folders: Folders) -> Non
     for name in map(str, names):
         if name not in known:
             raise BcrlError(f"{group}={name}: {did_you_mean(name, known)}")
+
+
+def job(config: DictConfig, hydra: DictConfig) -> Plan:
+    """The plan of one of the jobs that Hydra runs, given Hydra's part of its config."""
+    sources = hydra.runtime.config_sources
+    folders = [source.path for source in sources if source.schema == "file"]
+    return plan(config, hydra, folders)
 
 
 def plan(job: DictConfig, hydra: DictConfig, folders: Sequence[str]) -> Plan:

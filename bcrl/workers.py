@@ -103,6 +103,14 @@ def each(
             worker.end()
 
 
+def cores() -> int:
+    """Cores that this process may use; not every Slurm binds a job to its own."""
+    there = os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):
+        there = len(os.sched_getaffinity(0))
+    return min(there, int(os.environ.get("SLURM_CPUS_PER_TASK", there)))
+
+
 def _hand(worker: _Worker, waiting: list[tuple[int, Any]]) -> None:
     """The next job goes to this worker, if there is one."""
     if waiting:

@@ -43,6 +43,7 @@ def made_up_plan(
         stages=(),
         tasks=(),
         metrics=(),
+        asked=tuple(seeds),
         seeds=tuple(seeds),
         lockstep=1,
         device="cpu",
