@@ -51,6 +51,7 @@ class Config:
     runs_dir: str = "runs"
     tag: str | None = None
     progress: str = "auto"
+    logger: Any = field(default_factory=lambda: {"name": "none"})
     checkpoint_every: float = 60.0
 
 

@@ -13,12 +13,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from bcrl import checkpoints, records
+from bcrl import checkpoints, loggers, records
 from bcrl.compose import Plan
 from bcrl.errors import BcrlError
 from bcrl.evaluation import StepProbe
 from bcrl.interrupts import Stop
 from bcrl.locks import Lock, claimed
+from bcrl.loggers import Log
 from bcrl.probes import Probe
 from bcrl.progress import Tick, named
 from bcrl.stage import Course, Snapshot, Team
@@ -87,7 +88,8 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> Outcome:
             if not mine:
                 return Outcome(busy=busy)
             try:
-                outcome = _train(job, mine, resumes, held, tick, stop)
+                with loggers.opened(plan.config, directory, mine) as log:
+                    outcome = _train(job, mine, resumes, held, log, tick, stop)
             except Exception as error:
                 _note_failure(plan, mine, error)
                 raise
@@ -123,6 +125,7 @@ def _train(
     seeds: Seeds,
     resumes: bool,
     held: Mapping[int, Lock],
+    log: Log,
     tick: Callable[[Tick], None],
     stop: Stop,
 ) -> Outcome:
@@ -135,6 +138,7 @@ def _train(
         course, probe.kept = Course(plan.stages, team, stored["past"]), stored["kept"]
         rest = stored["session"] | {"rows": json.loads(stored["session"]["rows"])}
         session = Session(**rest)
+        log(probe.index, session.rows)
     clock = Clock(session)
     host = {"host": socket.gethostname(), "pid": os.getpid()}
     new = [s for s in seeds if not records.is_complete(plan.directory, s)]
@@ -153,7 +157,7 @@ def _train(
     for now in course:
         ends = isinstance(now, Snapshot) and now.last_of_stage
         if isinstance(now, Snapshot):
-            _look(probe, now, session)
+            _look(probe, now, session, log)
             clock.note()
             tick(Tick(job.number, now.stage.task, now.count, session.wall))
         if ends and now.count == plan.length:
@@ -202,12 +206,14 @@ def _record(
     return failed
 
 
-def _look(probe: Probe | StepProbe, now: Snapshot, session: Session) -> None:
+def _look(probe: Probe | StepProbe, now: Snapshot, session: Session, log: Log) -> None:
     """Measure a snapshot; a seed's last row is the one that shows its failure."""
     where = {"stage": now.stage.number, "task": now.stage.task, probe.index: now.count}
-    for place, metrics in enumerate(probe.measure(now)):
-        if place not in session.failed:
-            session.rows[place].append(where | metrics)
+    rows = [where | metrics for metrics in probe.measure(now)]
+    new = [[] if place in session.failed else [row] for place, row in enumerate(rows)]
+    log(probe.index, new)
+    for known, added in zip(session.rows, new, strict=True):
+        known += added
     for place, why in now.failed.items():
         session.failed.setdefault(place, f"{why} at {probe.index} {now.count}")
 

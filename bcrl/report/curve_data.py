@@ -29,7 +29,8 @@ def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, 
     found = {v.name: v for v in runs.of(env, family)}
     main = _main(runs, env, family, tag) or dict(list(found.items())[:FIRST_SHOWN])
     ours = {variant.name: variant for variant in main.values()}
-    dashes = dict(zip(found.keys() - ours.keys(), itertools.cycle(DASHES)))
+    others = [name for name in found if name not in ours]
+    dashes = dict(zip(others, itertools.cycle(DASHES), strict=False))
     metrics = metrics_of(found)
     return {
         "id": f"{env}-{family}",
