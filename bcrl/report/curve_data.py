@@ -21,7 +21,7 @@ SEEDS = 20  # whose own lines can be shown, the first of a variant's
 FIRST_SHOWN = 8  # variants that are shown at first if none has the tag
 #: Metrics that are shown at first, if the family has many.
 SHOWN = {"DQN": ("return", "success_rate", "greedy_return")}
-DASHES = ("7 3", "2 3", "9 3 2 3")  # of variants with other tags than the page's
+DASHES = ("7 3", "2 3", "9 3 2 3", "5 2")  # one's own algorithms, then other tags
 
 
 def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, Any]:
@@ -30,7 +30,8 @@ def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, 
     main = _main(runs, env, family, tag) or dict(list(found.items())[:FIRST_SHOWN])
     ours = {variant.name: variant for variant in main.values()}
     others = [name for name in found if name not in ours]
-    dashes = dict(zip(others, itertools.cycle(DASHES), strict=False))
+    dashes = {name: DASHES[0] for name, v in ours.items() if style.dashed(v.method)}
+    dashes |= dict(zip(others, itertools.cycle(DASHES[1:]), strict=False))
     metrics = metrics_of(found)
     return {
         "id": f"{env}-{family}",
@@ -45,8 +46,9 @@ def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, 
         "labels": {metric: label(family, metric) for metric in metrics},
         "shown": [m for m in metrics if m in SHOWN.get(family, metrics)] or metrics,
         "series": [
-            _series(variant, metrics, dashes.get(variant.name, ""))
-            for variant in (ours | found).values()
+            {"on": name in ours, "dash": dashes.get(name, "")}
+            | _series(variant, metrics)
+            for name, variant in (ours | found).items()
         ],
     }
 
@@ -58,15 +60,13 @@ def _main(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, Varia
     return runs.tagged(env, family, tag)
 
 
-def _series(variant: Variant, metrics: list[str], dash: str) -> dict[str, Any]:
+def _series(variant: Variant, metrics: list[str]) -> dict[str, Any]:
     """A variant's curves, which all have the same points."""
     light = style.colour(variant.method)
     series = {
         "name": variant.name,
         "light": light,
         "dark": _on_black(light),
-        "dash": dash,
-        "on": not dash,
         "metrics": {},
     }
     for metric in metrics:

@@ -75,6 +75,11 @@ def colour(method: str) -> str:
 Span = tuple[str, float, float]  # a task's name, where it begins and ends
 
 
+def dashed(method: str) -> bool:
+    """Whether it is another algorithm than the families': its lines are dashed."""
+    return method not in COLOURS and method.rpartition("-")[2] not in ("FQI", "DQN")
+
+
 def stage_spans(variants: Iterable[Variant]) -> list[Span]:
     """Name and extent, on the iteration axis, of every task of the longest variant.
 
@@ -134,12 +139,22 @@ def band(
 ) -> None:
     """A mean line with a band around it."""
     axes.fill_between(x, low, high, color=colour(method), alpha=0.25, linewidth=0)
-    axes.plot(x, centre, color=colour(method), linewidth=1.6)
+    line = "--" if dashed(method) else "-"
+    axes.plot(x, centre, color=colour(method), linewidth=1.6, linestyle=line)
 
 
 def legend(figure: Figure, methods: Iterable[str], optimum: bool = False) -> None:
     """One legend for the whole figure, above it."""
-    handles = [Line2D([], [], color=colour(m), linewidth=2, label=m) for m in methods]
+    handles = [
+        Line2D(
+            *([], []),
+            color=colour(method),
+            linestyle="--" if dashed(method) else "-",
+            linewidth=2,
+            label=method,
+        )
+        for method in methods
+    ]
     if optimum:
         handles.append(Line2D([], [], label="optimum of the target", **OPTIMUM))
     figure.legend(
