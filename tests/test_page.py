@@ -217,8 +217,8 @@ def test_what_is_incomplete_is_said_first(tmp_path):
 
 def test_animations_of_the_scale_are_shown(own):
     (own / "figures").mkdir()
-    for name in ("maze_agent_smoke.gif", "maze_agent_quick.gif"):
+    for name in ("agent_maze_FQI_smoke.gif", "agent_maze_FQI_quick.gif"):
         Image.new("P", (4, 4)).save(own / "figures" / name)
     page = written(own)
     assert page.count("data:image/gif;base64,") == 1
-    assert "<figcaption>maze agent</figcaption>" in page
+    assert "<figcaption>maze_FQI</figcaption>" in page

@@ -132,8 +132,8 @@ def report(
         for pair, (png, _) in curves.items()
     }
     agents = [
-        Picture(path, path.stem.removesuffix(f"_{suffix}").replace("_", " "))
-        for path in sorted(out.glob(f"*_{suffix}.gif"))
+        Picture(path, path.stem[len("agent_") : -len(f"_{runs.scale}")])
+        for path in sorted(out.glob(f"agent_*{tagged}_{runs.scale}.gif"))
     ]
     text = page(runs, tag, drawn, fallback, agents)
     files.append(write_text(out / f"report_{suffix}.html", text))

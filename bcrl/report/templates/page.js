@@ -412,11 +412,14 @@
       const tip = html("div", { class: "tip", role: "status" }, head);
       tip.append(html("table", {}, html("tbody", {}, ...rows)));
       view.panel.append(tip);
-      const scale = view.svg.clientWidth / view.width;
-      const x = view.toX(at) * scale, room = view.panel.clientWidth;
+      const [outer, inner] = [view.panel, view.svg].map((e) => e.getBoundingClientRect());
+      const x = view.toX(at) * (inner.width / view.width), room = outer.width;
       const left = x + 14 + tip.offsetWidth <= room ? x + 14 : x - 14 - tip.offsetWidth;
       tip.style.left = `${Math.max(0, Math.min(left, room - tip.offsetWidth))}px`;
-      tip.style.top = `${view.svg.offsetTop + MARGIN.top}px`;
+      // Below the curves, unless that is out of sight.
+      const fits = inner.bottom + tip.offsetHeight < window.innerHeight;
+      const top = fits ? inner.bottom - MARGIN.bottom : inner.top + MARGIN.top;
+      tip.style.top = `${top - outer.top + 4}px`;
     }
   }
 
