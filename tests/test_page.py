@@ -74,7 +74,7 @@ def reported(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("reported")
     write_own(root)
     (root / "figures").mkdir()
-    for name in ("agent_maze_FQI_smoke.gif", "agent_maze_FQI_quick.gif"):
+    for name in (f"agent_{OWN}_FQI_smoke.gif", f"agent_{OWN}_FQI_quick.gif"):
         Image.new("P", (4, 4)).save(root / "figures" / name)
     written(root)
     return root
@@ -236,4 +236,4 @@ def test_what_is_incomplete_is_said_first(tmp_path):
 def test_animations_of_the_scale_are_shown(reported):
     page = page_of(reported)
     assert page.count("data:image/gif;base64,") == 1
-    assert "<figcaption>maze_FQI</figcaption>" in page
+    assert "<figcaption>My &lt;i&gt;env: FQI</figcaption>" in page

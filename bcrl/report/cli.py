@@ -15,10 +15,10 @@ from bcrl import __version__
 from bcrl.errors import BcrlError
 from bcrl.files import make_directory, write_text
 from bcrl.report import style
-from bcrl.report.animation import animations
+from bcrl.report.animation import animations, gif_of
 from bcrl.report.curves import LINEAR, figure_methods
 from bcrl.report.document import claims_report
-from bcrl.report.figures import figure_1, figure_2, figure_5
+from bcrl.report.figures import env_title, figure_1, figure_2, figure_5
 from bcrl.report.learning import figure_curves
 from bcrl.report.linear_figures import figure_4a, figure_4b
 from bcrl.report.load import COMPARED, load_runs
@@ -132,8 +132,9 @@ def report(
         for pair, (png, _) in curves.items()
     }
     agents = [
-        Picture(path, path.stem[len("agent_") : -len(f"_{runs.scale}")])
-        for path in sorted(out.glob(f"agent_*{tagged}_{runs.scale}.gif"))
+        Picture(path, f"{env_title(variant.env)}: {variant.name}")
+        for variant in runs.variants
+        if tag in (None, variant.tag) and (path := gif_of(runs, variant, out)).exists()
     ]
     text = page(runs, tag, drawn, fallback, agents)
     files.append(write_text(out / f"report_{suffix}.html", text))
