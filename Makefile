@@ -3,10 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+SCALE ?= quick
 WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup figures paper searches smoke verify test lint bench bench-peer clean
+.PHONY: help setup figures paper searches smoke report verify test lint bench bench-peer clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -35,6 +36,9 @@ searches: $(READY) ## the searches of appendix C.3 on seeds of their own, with s
 smoke: $(READY) ## every variant in seconds, then the report
 	$(BIN)/bcrl -m experiment=fig1,fig2,fig4 scale=smoke workers=$(WORKERS)
 	$(BIN)/bcrl-report --scale smoke
+
+report: $(READY) ## figures, claims and one HTML page of what is in runs/; SCALE=paper
+	$(BIN)/bcrl-report --scale $(SCALE)
 
 verify: $(READY) ## whether every result in runs/ is whole, unchanged and in its place
 	$(BIN)/bcrl-verify

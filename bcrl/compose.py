@@ -19,6 +19,7 @@ from bcrl.config import Choice, Config, construct, one_of
 from bcrl.envs import Env, is_simulated
 from bcrl.errors import ConfigError, at_least, did_you_mean
 from bcrl.identity import Plain, differences
+from bcrl.loggers import logger
 from bcrl.safety import check_name
 from bcrl.stage import Stage
 from bcrl.tasks import tasks_of
@@ -173,6 +174,7 @@ def _check_outputs(config: Plain) -> None:
     if not config["checkpoint_every"] > 0 or config["checkpoint_every"] == math.inf:
         why = "must be a number of seconds above 0"
         raise ConfigError("checkpoint_every", config["checkpoint_every"], why)
+    logger(config["logger"])
     one_of("progress", config["progress"], ["auto", "bar", "lines", "none"])
     for key, value in (("tag", config["tag"]), ("scale.name", scale["name"])):
         if value is not None:

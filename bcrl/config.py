@@ -53,6 +53,7 @@ class Config:
     tag: str | None = None
     progress: str = "auto"
     strict: bool = False
+    logger: Any = field(default_factory=lambda: {"name": "none"})
     checkpoint_every: float = 60.0
 
 

@@ -10,7 +10,7 @@ Plain = dict[str, Any]  # a resolved config: dicts, lists and scalars
 #: for another device's rounding.
 OUTPUT_KEYS = (
     *("seeds", "workers", "threads", "device"),
-    *("runs_dir", "tag", "progress", "strict", "checkpoint_every"),
+    *("runs_dir", "tag", "progress", "strict", "checkpoint_every", "logger"),
 )
 
 

@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from bcrl import checkpoints, records
+from bcrl import checkpoints, loggers, records
 from bcrl.compose import Plan
 from bcrl.errors import BcrlError
 from bcrl.evaluation import StepProbe
 from bcrl.interrupts import Stop
 from bcrl.locks import Lock, claimed
+from bcrl.loggers import Log
 from bcrl.probes import Probe
 from bcrl.progress import Tick, named
 from bcrl.stage import Course, Snapshot, Team
@@ -90,8 +91,11 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> Outcome:
                 return Outcome(busy=busy)
             strict = "raise" if plan.config["strict"] else "warn"
             try:
-                with np.errstate(divide=strict, over=strict, invalid=strict):
-                    outcome = _train(job, mine, resumes, held, tick, stop)
+                with (
+                    loggers.opened(plan.config, directory, mine) as log,
+                    np.errstate(divide=strict, over=strict, invalid=strict),
+                ):
+                    outcome = _train(job, mine, resumes, held, log, tick, stop)
             except Exception as error:
                 _note_failure(plan, mine, error)
                 raise
@@ -127,6 +131,7 @@ def _train(
     seeds: Seeds,
     resumes: bool,
     held: Mapping[int, Lock],
+    log: Log,
     tick: Callable[[Tick], None],
     stop: Stop,
 ) -> Outcome:
@@ -139,6 +144,7 @@ def _train(
         course, probe.kept = Course(plan.stages, team, stored["past"]), stored["kept"]
         rest = stored["session"] | {"rows": json.loads(stored["session"]["rows"])}
         session = Session(**rest)
+        log(probe.index, session.rows)
     clock = Clock(session)
     host = {"host": socket.gethostname(), "pid": os.getpid()}
     new = [s for s in seeds if not records.is_complete(plan.directory, s)]
@@ -157,7 +163,7 @@ def _train(
     for now in course:
         ends = isinstance(now, Snapshot) and now.last_of_stage
         if isinstance(now, Snapshot):
-            _look(probe, now, session)
+            _look(probe, now, session, log)
             clock.note()
             tick(Tick(job.number, now.stage.task, now.count, session.wall))
         if ends and now.count == plan.length:
@@ -206,12 +212,14 @@ def _record(
     return failed
 
 
-def _look(probe: Probe | StepProbe, now: Snapshot, session: Session) -> None:
+def _look(probe: Probe | StepProbe, now: Snapshot, session: Session, log: Log) -> None:
     """Measure a snapshot; a seed's last row is the one that shows its failure."""
     where = {"stage": now.stage.number, "task": now.stage.task, probe.index: now.count}
-    for place, metrics in enumerate(probe.measure(now)):
-        if place not in session.failed:
-            session.rows[place].append(where | metrics)
+    rows = [where | metrics for metrics in probe.measure(now)]
+    new = [[] if place in session.failed else [row] for place, row in enumerate(rows)]
+    log(probe.index, new)
+    for known, added in zip(session.rows, new, strict=True):
+        known += added
     for place, why in now.failed.items():
         session.failed.setdefault(place, f"{why} at {probe.index} {now.count}")
 

@@ -207,7 +207,7 @@ def test_everything_is_written_and_listed(runs_dir, capsys):
     assert skipped == ["skipped figure 4a", "skipped figure 4b"]  # no linear system
     listed = {Path(line) for line in captured.out.splitlines()}
     names = {f"figure_{n}_smoke.{k}" for n in "1235" for k in ("png", "pdf")}
-    names |= {"aggregate_smoke.csv", "claims_smoke.md"}
+    names |= {"aggregate_smoke.csv", "claims_smoke.md", "report_smoke.html"}
     assert listed == {runs_dir / "figures" / name for name in names}
     assert {p.name for p in (runs_dir / "figures").iterdir()} == names
 
@@ -216,7 +216,7 @@ def test_two_reports_are_byte_identical(runs_dir, tmp_path):
     for name in ("a", "b"):
         assert run(runs_dir, "--out", str(tmp_path / name), "--figures", "3") == 0
     written = sorted(p.name for p in (tmp_path / "a").iterdir())
-    assert len(written) == 4
+    assert len(written) == 5
     for name in written:
         first, second = ((tmp_path / d / name).read_bytes() for d in "ab")
         assert first == second

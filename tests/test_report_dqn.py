@@ -232,7 +232,7 @@ def test_both_figures_are_drawn(tmp_path, capsys, seeds, methods):
     write(tmp_path, methods, range(seeds))
     assert run(tmp_path, "--figures", "4a", "4b") == 0
     names = {f"figure_4{x}_smoke.{k}" for x in "ab" for k in ("png", "pdf")}
-    names |= {"aggregate_dqn_smoke.csv", "claims_smoke.md"}
+    names |= {"aggregate_dqn_smoke.csv", "claims_smoke.md", "report_smoke.html"}
     assert {p.name for p in (tmp_path / "figures").iterdir()} == names
     assert "skipped" not in capsys.readouterr().err
 

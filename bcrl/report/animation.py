@@ -33,13 +33,18 @@ def animations(
     files, skipped = [], []
     for variant in _chosen(runs, tag, asked):
         seed = typical_seed(variant)
-        name = f"agent_{variant.env}_{variant.name}_{runs.scale}.gif"
+        path = gif_of(runs, variant, out)
         try:
             shown = list(frames(variant, seed))
-            files.append(_write(out / name, *zip(*shown, strict=True)))
+            files.append(_write(path, *zip(*shown, strict=True)))
         except BcrlError as error:
-            skipped.append(f"{name}: {error}")
+            skipped.append(f"{path.name}: {error}")
     return files, skipped
+
+
+def gif_of(runs: Runs, variant: Variant, out: Path) -> Path:
+    """Where a variant's GIF is, if it has one."""
+    return out / f"agent_{variant.env}_{variant.name}_{runs.scale}.gif"
 
 
 def _chosen(runs: Runs, tag: str | None, asked: Sequence[str]) -> list[Variant]:

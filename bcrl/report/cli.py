@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,13 +15,15 @@ from bcrl import __version__
 from bcrl.errors import BcrlError
 from bcrl.files import make_directory, write_text
 from bcrl.report import style
-from bcrl.report.animation import animations
+from bcrl.report.animation import animations, gif_of
 from bcrl.report.curves import LINEAR, figure_methods
 from bcrl.report.document import claims_report
-from bcrl.report.figures import figure_1, figure_2, figure_5
+from bcrl.report.figures import env_title, figure_1, figure_2, figure_5
+from bcrl.report.learning import figure_curves
 from bcrl.report.linear_figures import figure_4a, figure_4b
-from bcrl.report.load import load_runs
+from bcrl.report.load import COMPARED, load_runs
 from bcrl.report.maze_figure import figure_3
+from bcrl.report.page import Picture, Pictures, page
 from bcrl.report.sweeps import groups, sweep_report, sweep_table
 from bcrl.report.tables import aggregate
 from bcrl.report.variants import Runs
@@ -34,13 +37,15 @@ FIGURES: dict[str, tuple[str, str, str | None, Callable[..., Figure]]] = {
     "4b": (LINEAR, "fig4", None, figure_4b),
     "5": ("maze", "fig2", "BC-FQI", figure_5),
 }
+CURVES = "curves"  # learning curves of what the paper has no figure of
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line; its help is the reference."""
     result = argparse.ArgumentParser(
         prog="bcrl-report",
-        description="Draw the paper's figures and judge its claims from finished runs.",
+        description="Draw figures of finished runs, judge the paper's claims, and show "
+        "all of it on one HTML page.",
     )
     result.add_argument(
         "--runs-dir", type=Path, default=Path("runs"), help="default: %(default)s"
@@ -54,9 +59,10 @@ def parser() -> argparse.ArgumentParser:
         "--figures",
         nargs="+",
         default=["all"],
-        choices=["all", *FIGURES],
+        choices=["all", *FIGURES, CURVES],
         metavar="N",
-        help=f"which of {', '.join(FIGURES)}, or all; default: all",
+        help=f"which of {', '.join(FIGURES)}, {CURVES} (where the paper has no figure) "
+        "or all; default: all",
     )
     result.add_argument(
         "--tag",
@@ -86,7 +92,10 @@ def report(
     suffix = f"{runs.scale}@{tag}" if tag else runs.scale
     tagged = f"@{tag}" if tag else ""
     files, skipped = [], []
+    drawn: Pictures = {}
     for name in figures:
+        if name == CURVES:
+            continue
         env, experiment, needed, draw = FIGURES[name]
         linear = env == LINEAR
         methods = figure_methods(runs, tag) if linear else runs.methods(env, tag)
@@ -100,7 +109,13 @@ def report(
             continue
         with style.sheet():
             title = f"Klink et al. (2022), figure {name}, reproduced: {suffix}"
-            files += style.save(draw(runs, tag), out, f"figure_{name}_{suffix}", title)
+            saved = style.save(draw(runs, tag), out, f"figure_{name}_{suffix}", title)
+        files += saved
+        caption = f"Figure {name}. {inspect.getdoc(draw).splitlines()[0]}"
+        pair = (env, "DQN" if linear else "FQI")
+        drawn.setdefault(pair, []).append(Picture(saved[0], caption))
+    curves = draw_curves(runs, out, tag) if CURVES in figures else {}
+    files += [path for saved in curves.values() for path in saved]
     families = {variant.family for variant in runs.variants}
     for family, stem in (("FQI", "aggregate"), ("DQN", "aggregate_dqn")):
         if family in families:
@@ -112,7 +127,35 @@ def report(
         files.append(write_text(out / f"sweep_{runs.scale}.md", text))
         table = sweep_table(compared)
         files.append(_write_csv(out / f"sweep_{runs.scale}.csv", table))
+    fallback = {
+        pair: [Picture(png, "Mean over seeds with 95 % intervals.")]
+        for pair, (png, _) in curves.items()
+    }
+    agents = [
+        Picture(path, f"{env_title(variant.env)}: {variant.name}")
+        for variant in runs.variants
+        if tag in (None, variant.tag) and (path := gif_of(runs, variant, out)).exists()
+    ]
+    text = page(runs, tag, drawn, fallback, agents)
+    files.append(write_text(out / f"report_{suffix}.html", text))
     return files, skipped
+
+
+def draw_curves(
+    runs: Runs, out: Path, tag: str | None
+) -> dict[tuple[str, str], list[Path]]:
+    """Learning curves wherever the paper has no figure: (env, family) → PNG, PDF."""
+    suffix = f"{runs.scale}@{tag}" if tag else runs.scale
+    files = {}
+    for env, family in runs.pairs:
+        if (env, family) in COMPARED or not runs.tagged(env, family, tag):
+            continue
+        with style.sheet():
+            drawn = figure_curves(runs, env, family, tag)
+            title = f"{env}, {family}: learning curves, {suffix}"
+            name = f"curves_{env}_{family}_{suffix}"
+            files[env, family] = style.save(drawn, out, name, title)
+    return files
 
 
 def _write_csv(path: Path, table: pd.DataFrame) -> Path:
@@ -122,17 +165,20 @@ def _write_csv(path: Path, table: pd.DataFrame) -> Path:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; 0 if all went well, 2 with one message for what a user can mend."""
     options = parser().parse_args(arguments)
-    chosen = FIGURES if "all" in options.figures else dict.fromkeys(options.figures)
+    chosen = [*FIGURES, CURVES]
+    if "all" not in options.figures:
+        chosen = list(dict.fromkeys(options.figures))
     try:
         runs = load_runs(options.runs_dir, options.scale, options.allow_incomplete)
         for note in runs.notes:
             print(f"note: {note.text}", file=sys.stderr)
         out = options.out or options.runs_dir / "figures"
         make_directory(out, "--out")
-        files, skipped = report(runs, out, list(chosen), options.tag)
-        if options.gif is not None:
+        shown, not_shown = [], []
+        if options.gif is not None:  # first: the page shows them
             shown, not_shown = animations(runs, out, options.tag, options.gif)
-            files, skipped = files + shown, skipped + not_shown
+        files, skipped = report(runs, out, chosen, options.tag)
+        files, skipped = files + shown, skipped + not_shown
     except BcrlError as error:
         print(f"bcrl-report: {error}", file=sys.stderr)
         return 2

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from bcrl.report.claims import car_claims, maze_claims
-from bcrl.report.curves import linear_methods
+from bcrl.report.curves import LINEAR, linear_methods
 from bcrl.report.linear_claims import LATE, late_table, linear_claims
 from bcrl.report.notes import Note, incomplete, tags_shown
-from bcrl.report.tables import final_table, markdown, stage_table
+from bcrl.report.tables import Section, Table, final_table, stage_table
 from bcrl.report.variants import Runs, Variant
-from bcrl.report.verdicts import FEWEST_SEEDS
+from bcrl.report.verdicts import FEWEST_SEEDS, Claim
 
 HEADER = (
     "claim",
@@ -25,6 +25,8 @@ SECTIONS = (
     ("car_on_hill", "Car on the hill (§6.1, Fig. 1)", car_claims),
     ("maze", "Maze (§6.2 and C.2, Figs. 2, 3, 5)", maze_claims),
 )
+LINEAR_TITLE = "Linear system (§6.3 and C.3, Fig. 4)"
+NO_RUNS = "No runs.\n"
 
 PREAMBLE = f"""\
 Intervals are 95 %: percentile bootstrap over seeds for means and their differences,
@@ -39,41 +41,59 @@ by itself, without a correction for their number.
 def claims_report(runs: Runs, tag: str | None = None) -> str:
     """The Markdown document: per environment the claims and the values behind them."""
     tagged = f", variants @{tag}" if tag else ""
-    linear = linear_methods(runs, tag)
-    notes = [n for n in runs.notes if n.tag == tag or _stands_in(n, linear)]
+    notes = notes_of(runs, tag)
     parts = [f"# The paper's claims, scale {runs.scale}{tagged}\n"]
     if lacking := incomplete(notes):
         parts.append(f"**{lacking}**\n")
-    parts.append(PREAMBLE)
-    for env, title, claims in SECTIONS:
-        methods = runs.methods(env, tag)
-        parts.append(f"## {title}\n")
-        if not methods:
-            parts.append("No runs.\n")
-            continue
-        rows = [claim.row(methods) for claim in claims()]
-        parts.append(_tally([row[-1] for row in rows]))
-        parts.append(markdown(HEADER, rows))
-        parts.append("After the last iteration (IQM: interquartile mean over seeds):\n")
-        parts.append(final_table(methods))
-        parts.extend(_by_stage(methods))
-        parts.append(_cost(methods))
-    parts.extend(_linear_section(linear))
+    parts += [PREAMBLE, *map(str, claims_sections(runs, tag).values())]
     if notes:
         parts.append("## Notes on the runs\n")
         parts.append("\n".join(f"- {note.text}" for note in notes) + "\n")
     return "\n".join(parts)
 
 
-def _linear_section(methods: Mapping[str, Variant]) -> list[str]:
-    """The DQN family's claims and values, with who is of which tag."""
-    parts = ["## Linear system (§6.3 and C.3, Fig. 4)\n"]
+def notes_of(runs: Runs, tag: str | None) -> list[Note]:
+    """The notes on the runs that a document about the variants `tag` shows."""
+    linear = linear_methods(runs, tag)
+    return [n for n in runs.notes if n.tag == tag or _stands_in(n, linear)]
+
+
+def claims_sections(runs: Runs, tag: str | None) -> dict[tuple[str, str], Section]:
+    """(environment, family) of the paper's → its claims and the values behind them."""
+    found = {
+        (env, "FQI"): Section(title, _fqi_parts(runs.methods(env, tag), claims))
+        for env, title, claims in SECTIONS
+    }
+    linear = _linear_parts(linear_methods(runs, tag))
+    return found | {(LINEAR, "DQN"): Section(LINEAR_TITLE, linear)}
+
+
+def _fqi_parts(
+    methods: Mapping[str, Variant], claims: Callable[[], list[Claim]]
+) -> list[str | Table]:
+    """The claims about FQI's methods in one environment, and the values."""
     if not methods:
-        return [*parts, "No runs.\n"]
+        return [NO_RUNS]
+    rows = [claim.row(methods) for claim in claims()]
+    return [
+        _tally([row[-1] for row in rows]),
+        Table(HEADER, rows),
+        "After the last iteration (IQM: interquartile mean over seeds):\n",
+        final_table(methods),
+        *_by_stage(methods),
+        _cost(methods),
+    ]
+
+
+def _linear_parts(methods: Mapping[str, Variant]) -> list[str | Table]:
+    """The DQN family's claims and values, with who is of which tag."""
+    if not methods:
+        return [NO_RUNS]
+    parts: list[str | Table] = []
     if len({variant.tag for variant in methods.values()}) > 1:
         parts.append(f"{tags_shown(methods)}; the others are untagged.\n")
     rows = [claim.row(methods) for claim in linear_claims()]
-    parts += [_tally([row[-1] for row in rows]), markdown(HEADER, rows), LATE]
+    parts += [_tally([row[-1] for row in rows]), Table(HEADER, rows), LATE]
     return [*parts, late_table(methods), _cost(methods)]
 
 
@@ -90,10 +110,12 @@ def _tally(verdicts: list[str]) -> str:
     return f"{len(verdicts)} claims: {counted}.\n"
 
 
-def _by_stage(methods: Mapping[str, Variant]) -> list[str]:
+def _by_stage(methods: Mapping[str, Variant]) -> list[str | Table]:
     """What each stage ended with, so that the course can be followed."""
-    parts = ["Mean error |Q − Q*| in the trained task at every stage's end:\n"]
-    parts.append(stage_table(methods, "q_error"))
+    parts: list[str | Table] = [
+        "Mean error |Q − Q*| in the trained task at every stage's end:\n",
+        stage_table(methods, "q_error"),
+    ]
     if all("solved" in variant.metrics for variant in methods.values()):
         parts.append("Share of seeds solving the trained task at every stage's end:\n")
         parts.append(stage_table(methods, "solved"))
@@ -103,10 +125,10 @@ def _by_stage(methods: Mapping[str, Variant]) -> list[str]:
 
 
 def _cost(methods: Mapping[str, Variant]) -> str:
-    seconds = sum(
-        float(sidecar.get("cpu_seconds") or 0.0)
-        for variant in methods.values()
-        for sidecar in variant.sidecars
-    )
-    spent = f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
-    return f"CPU time of these runs: {spent}.\n"
+    seconds = sum(variant.total("cpu_seconds") for variant in methods.values())
+    return f"CPU time of these runs: {duration(seconds)}.\n"
+
+
+def duration(seconds: float) -> str:
+    """`1.5 h`, `12 s`."""
+    return f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"

@@ -22,6 +22,11 @@ ENV_TITLES = {
 }
 
 
+def env_title(env: str) -> str:
+    """An environment's name as a title: `Mountain car`, whoever it comes from."""
+    return ENV_TITLES.get(env, env.replace("_", " ").capitalize())
+
+
 def small_print(
     runs: Runs,
     methods: Mapping[str, Variant],
@@ -43,7 +48,7 @@ def small_print(
         seeds = "seeds " + ", ".join(f"{name} {n}" for name, n in counts.items())
     tags = tags_shown(methods)
     tagged = f" · {tags}" if tags else ""
-    lines = [f"{ENV_TITLES[env]} · scale {runs.scale} · {seeds}{tagged} · {what}"]
+    lines = [f"{env_title(env)} · scale {runs.scale} · {seeds}{tagged} · {what}"]
     lines += remarks(runs.notes, methods, compares)
     limit = int(width * FOOTER_WIDTH)
     return [part for line in lines for part in textwrap.wrap(line, limit)]
@@ -59,8 +64,8 @@ def _mean_bands(axes: Axes, methods: Mapping[str, Variant], metric: str) -> None
     """Mean ± 2 standard errors of every method."""
     for name, variant in methods.items():
         values = variant.metrics[metric]
-        half = 2 * standard_error(values)
-        style.band(axes, variant.index, mean(values), half, name)
+        centre, half = mean(values), 2 * standard_error(values)
+        style.band(axes, variant.index, centre, centre - half, centre + half, name)
 
 
 def _panels(

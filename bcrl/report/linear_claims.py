@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from bcrl.report.curves import WINDOW, area, last, late
 from bcrl.report.statistics import interquartile_mean
-from bcrl.report.tables import markdown, mean_cell, number
+from bcrl.report.tables import Table, mean_cell, number
 from bcrl.report.variants import Variant
 from bcrl.report.verdicts import Claim, Measured, between
 
@@ -50,7 +50,7 @@ def seeds_cell(variant: Variant) -> str:
     return f"{len(variant.seeds)}{failed}"
 
 
-def late_table(methods: Mapping[str, Variant]) -> str:
+def late_table(methods: Mapping[str, Variant]) -> Table:
     """The target's values per method at the end, late and over the whole curve."""
     header = (
         *("method", "seeds", "last return", "late return", "late return, IQM"),
@@ -70,4 +70,4 @@ def late_table(methods: Mapping[str, Variant]) -> str:
         ]
         for variant in methods.values()
     ]
-    return markdown(header, rows)
+    return Table(header, rows)

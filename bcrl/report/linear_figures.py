@@ -38,8 +38,9 @@ def _curve(
 ) -> None:
     """Mean ± 2 standard errors over environment steps."""
     values = variant.metrics[metric][:, rows]
-    half = 2 * standard_error(values)
-    style.band(axes, variant.index[rows], mean(values), half, method)
+    centre, half = mean(values), 2 * standard_error(values)
+    x = variant.index[rows]
+    style.band(axes, x, centre, centre - half, centre + half, method)
 
 
 def _step_axis(axes: Axes) -> None:

@@ -40,13 +40,14 @@ def load_runs(runs_dir: Path, scale: str, allow_incomplete: bool = False) -> Run
     if not variants:
         raise BcrlError(_nothing(runs_dir, scale, notes))
     runs = Runs(scale, variants, notes)
-    for (env, family), expected in COMPARED.items():
+    for env, family in runs.pairs:
+        expected = COMPARED.get((env, family))
         ours = [v for v in variants if (v.env, v.family) == (env, family)]
         for tag in sorted({v.tag or "" for v in ours}):
-            found = runs.methods(env, tag or None, family)
-            methods = {name: found[name] for name in expected if name in found}
+            found = runs.tagged(env, family, tag or None)
+            methods = {n: v for n, v in found.items() if n in (expected or found)}
             # A tag may be meant for one method only, so absent ones go unmentioned.
-            awaited = methods if tag else expected
+            awaited = methods if tag else expected or methods
             notes.extend(across_methods(methods, awaited, env, tag or None, family))
     return runs
 

@@ -86,6 +86,21 @@ def bootstrap(values: ArrayLike, statistic: Statistic = row_mean) -> Interval:
     return _percentiles(_resampled(values, statistic, np.random.default_rng(SEED)))
 
 
+def bootstrap_curves(
+    values: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """`bootstrap` of the mean at every point of (S, I) curves: both ends, (I,) each."""
+    n = len(values)
+    if n < 2:
+        return np.full((2, values.shape[1]), math.nan)
+    rows = np.random.default_rng(SEED).integers(n, size=(RESAMPLES, n))
+    places = rows + n * np.arange(RESAMPLES)[:, None]
+    counts = np.bincount(places.ravel(), minlength=RESAMPLES * n).reshape(-1, n)
+    tail = (1.0 - LEVEL) / 2.0
+    low, high = np.quantile(counts @ values / n, [tail, 1.0 - tail], axis=0)
+    return low, high
+
+
 def bootstrap_difference(
     first: ArrayLike, second: ArrayLike, statistic: Statistic = row_mean
 ) -> Interval:

@@ -72,20 +72,40 @@ def colour(method: str) -> str:
     return COLOURS.get(prefix, COLOURS["PPR"]) if dash else COLOURS[""]
 
 
-def stage_spans(variants: Iterable[Variant]) -> list[tuple[str, float, float]]:
+Span = tuple[str, float, float]  # a task's name, where it begins and ends
+
+
+def dashed(method: str) -> bool:
+    """Whether it is another algorithm than the families': its lines are dashed."""
+    return method not in COLOURS and method.rpartition("-")[2] not in ("FQI", "DQN")
+
+
+def stage_spans(variants: Iterable[Variant]) -> list[Span]:
     """Name and extent, on the iteration axis, of every task of the longest variant.
 
     Of equally long ones it is the one with most tasks, hence one with a curriculum.
     """
-    shown = max(variants, key=lambda v: (len(v.stage), len(np.unique(v.task))))
-    starts = [0, *(np.flatnonzero(np.diff(shown.task)) + 1), len(shown.task)]
+    return task_spans(
+        max(variants, key=lambda v: (len(v.stage), len(np.unique(v.task))))
+    )
+
+
+def task_spans(variant: Variant) -> list[Span]:
+    """Name and extent, on the axis of iterations or steps, of every task of a variant.
+
+    An iteration reaches half a one to either side; steps go on from task to task.
+    """
+    starts = [0, *(np.flatnonzero(np.diff(variant.task)) + 1), len(variant.task)]
+    edges = np.arange(len(variant.task) + 1) + 0.5
+    if variant.family == "DQN":
+        edges = np.append(variant.index, variant.index[-1])
     return [
-        (f"T{shown.task[start]}", start + 0.5, end + 0.5)
+        (f"T{variant.task[start]}", float(edges[start]), float(edges[end]))
         for start, end in itertools.pairwise(starts)
     ]
 
 
-def shade_tasks(axes: Axes, spans: Sequence[tuple[str, float, float]]) -> None:
+def shade_tasks(axes: Axes, spans: Sequence[Span]) -> None:
     """Grey bands, one per task, named above the axes; narrow ones in two rows."""
     first, last = spans[0][1], spans[-1][2]
     axes.set_xlim(first, last)
@@ -113,19 +133,28 @@ def band(
     axes: Axes,
     x: NDArray[np.int64],
     centre: NDArray[np.float64],
-    half: NDArray[np.float64],
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
     method: str,
 ) -> None:
-    """A mean line with a band of `half` to either side."""
-    axes.fill_between(
-        x, centre - half, centre + half, color=colour(method), alpha=0.25, linewidth=0
-    )
-    axes.plot(x, centre, color=colour(method), linewidth=1.6)
+    """A mean line with a band around it."""
+    axes.fill_between(x, low, high, color=colour(method), alpha=0.25, linewidth=0)
+    line = "--" if dashed(method) else "-"
+    axes.plot(x, centre, color=colour(method), linewidth=1.6, linestyle=line)
 
 
 def legend(figure: Figure, methods: Iterable[str], optimum: bool = False) -> None:
     """One legend for the whole figure, above it."""
-    handles = [Line2D([], [], color=colour(m), linewidth=2, label=m) for m in methods]
+    handles = [
+        Line2D(
+            *([], []),
+            color=colour(method),
+            linestyle="--" if dashed(method) else "-",
+            linewidth=2,
+            label=method,
+        )
+        for method in methods
+    ]
     if optimum:
         handles.append(Line2D([], [], label="optimum of the target", **OPTIMUM))
     figure.legend(

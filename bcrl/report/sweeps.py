@@ -16,7 +16,7 @@ from bcrl.report.curves import WINDOW, last, late
 from bcrl.report.linear_claims import seeds_cell
 from bcrl.report.notes import ranges
 from bcrl.report.statistics import bootstrap
-from bcrl.report.tables import estimate, markdown
+from bcrl.report.tables import Section, Table, estimate
 from bcrl.report.variants import Runs, Variant
 
 IGNORED = (*OUTPUT_KEYS, "scale")  # top-level keys of a config that all may differ in
@@ -125,7 +125,7 @@ def _seeds(variant: Variant) -> str:
     return f"{ranges(variant.seeds)} · {seeds_cell(variant)}"
 
 
-def _best_table(found: list[Group]) -> str:
+def _best_table(found: list[Group]) -> Table:
     rows = []
     for group in found:
         best = group.best
@@ -137,10 +137,10 @@ def _best_table(found: list[Group]) -> str:
         chosen = ", ".join(f"{key} = {value}" for key, value in pairs) or ABSENT
         rows.append([*row, best.name, chosen, _cell(deciding(best)), _seeds(best)])
     header = ("environment", "method", "variants", "best", "its settings", "return")
-    return markdown([*header, "seeds · number"], rows)
+    return Table([*header, "seeds · number"], rows)
 
 
-def _group_table(group: Group) -> str:
+def _group_table(group: Group) -> Table:
     header = ["variant", *group.keys, "seeds · number", "late return", "last return"]
     rows = []
     for variant in group.variants:
@@ -150,25 +150,29 @@ def _group_table(group: Group) -> str:
             decides = 1 if variant.family == "FQI" else 0
             returns[decides] = f"**{returns[decides]}**"
         rows.append([*cells, *returns, _cell(success(variant))])
-    return markdown([*header, "success rate"], rows)
+    return Table([*header, "success rate"], rows)
 
 
 def sweep_report(runs: Runs, found: list[Group]) -> str:
     """The Markdown document: the best of each group, then every group."""
-    parts = [f"# Variants compared, scale {runs.scale}\n", PREAMBLE, "## Best\n"]
-    parts.append(_best_table(found))
-    for group in found:
-        parts.append(f"## {group.env}: {group.method}\n")
-        used = {ranges(variant.seeds) for variant in group.variants}
-        same = f"Seeds {used.pop()}." if len(used) == 1 else "Seeds differ by row."
-        parts.append(f"{len(group.variants)} variants. {same}\n")
-        parts.append(_group_table(group))
+    parts = [f"# Variants compared, scale {runs.scale}\n", PREAMBLE]
+    parts += map(str, sweep_sections(found))
     ours = {(group.env, group.method) for group in found}
     odd = [n.text for n in runs.notes if (n.env, n.method) in ours]
     if odd:
         parts.append("## Notes on these runs\n")
         parts.append("\n".join(f"- {text}" for text in odd) + "\n")
     return "\n".join(parts)
+
+
+def sweep_sections(found: list[Group]) -> Iterator[Section]:
+    """The best of each group, then every group."""
+    yield Section("Best", [_best_table(found)])
+    for group in found:
+        used = {ranges(variant.seeds) for variant in group.variants}
+        same = f"Seeds {used.pop()}." if len(used) == 1 else "Seeds differ by row."
+        text = f"{len(group.variants)} variants. {same}\n"
+        yield Section(f"{group.env}: {group.method}", [text, _group_table(group)])
 
 
 def sweep_table(found: list[Group]) -> pd.DataFrame:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -69,14 +70,28 @@ def estimate(value: float, interval: Interval) -> str:
     return f"{number(value)} [{number(interval.low)}, {number(interval.high)}]"
 
 
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table; bars inside cells are escaped."""
+class Table(NamedTuple):
+    """Cells of text; as a string it is Markdown, with bars inside cells escaped."""
 
-    def line(cells: Sequence[str]) -> str:
-        return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
 
-    rule = "|" + "---|" * len(header)
-    return "\n".join([line(header), rule, *map(line, rows)]) + "\n"
+    def __str__(self) -> str:
+        def line(cells: Sequence[str]) -> str:
+            return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+        rule = "|" + "---|" * len(self.header)
+        return "\n".join([line(self.header), rule, *map(line, self.rows)]) + "\n"
+
+
+class Section(NamedTuple):
+    """Paragraphs and tables below a title; as a string it is Markdown."""
+
+    title: str
+    parts: Sequence[str | Table]
+
+    def __str__(self) -> str:
+        return "\n".join([f"## {self.title}\n", *map(str, self.parts)])
 
 
 def mean_cell(values: NDArray[np.float64]) -> str:
@@ -93,7 +108,7 @@ def _bracket(interval: Interval) -> str:
     return f"[{number(interval.low)}, {number(interval.high)}]"
 
 
-def final_table(methods: Mapping[str, Variant]) -> str:
+def final_table(methods: Mapping[str, Variant]) -> Table:
     """Every metric after the last iteration: mean with interval, interquartile mean."""
     metrics = [m for m in ("q_error", "q_error_start", "return") if _all(methods, m)]
     header = ["method", "seeds", *metrics, *(f"{m}, IQM" for m in metrics)]
@@ -106,10 +121,10 @@ def final_table(methods: Mapping[str, Variant]) -> str:
         if solved:
             row.append(_share_cell(variant.metrics["solved"][:, -1]))
         rows.append(row)
-    return markdown([*header, "seeds solving the target"] if solved else header, rows)
+    return Table([*header, "seeds solving the target"] if solved else header, rows)
 
 
-def stage_table(methods: Mapping[str, Variant], metric: str) -> str:
+def stage_table(methods: Mapping[str, Variant], metric: str) -> Table:
     """The mean of `metric` over seeds at the end of every stage, with its task."""
     longest = max(methods.values(), key=lambda v: len(v.stage))
     stages = np.unique(longest.stage)
@@ -121,7 +136,7 @@ def stage_table(methods: Mapping[str, Variant], metric: str) -> str:
             values = variant.metrics[metric][:, at[-1]] if len(at) else None
             row.append("–" if values is None else number(float(values.mean())))
         rows.append(row)
-    return markdown(["method", *(f"stage {stage}" for stage in stages)], rows)
+    return Table(["method", *(f"stage {stage}" for stage in stages)], rows)
 
 
 def _all(methods: Mapping[str, Variant], metric: str) -> bool:

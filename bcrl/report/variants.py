@@ -56,6 +56,10 @@ class Variant:
         (value,) = values if len(values) == 1 else (None,)
         return None if value is None else float(value)
 
+    def total(self, fact: str) -> float:
+        """The sum over seeds of a number in their JSON documents."""
+        return sum(float(sidecar.get(fact) or 0.0) for sidecar in self.sidecars)
+
     def arrays(self, seed: int, *names: str) -> list[NDArray[np.float64]]:
         """The named arrays of a seed's NPZ; BcrlError if it does not hold them."""
         return read_arrays(self.npz(seed), *names)
@@ -73,6 +77,27 @@ class Runs:
     variants: tuple[Variant, ...]
     notes: list[Note] = field(default_factory=list)
 
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """The environments and families that there are runs of."""
+        return list(dict.fromkeys((v.env, v.family) for v in self.variants))
+
+    def of(self, env: str, family: str) -> list[Variant]:
+        """All variants of these, untagged ones first, in the legends' order."""
+        known = FAMILIES[family]
+
+        def place(variant: Variant) -> tuple[str, int, str]:
+            method = variant.method
+            rank = known.index(method) if method in known else len(known)
+            return variant.tag or "", rank, method
+
+        ours = (v for v in self.variants if (v.env, v.family) == (env, family))
+        return sorted(ours, key=place)
+
+    def tagged(self, env: str, family: str, tag: str | None) -> dict[str, Variant]:
+        """All methods of that tag, also those that FAMILIES doesn't know."""
+        return {v.method: v for v in self.of(env, family) if v.tag == tag}
+
     def methods(
         self, env: str, tag: str | None, family: str = "FQI", fall_back: bool = False
     ) -> dict[str, Variant]:
@@ -81,8 +106,7 @@ class Runs:
         `fall_back`: a method without a run of that tag is represented by its untagged
         one, provided that some method has the tag.
         """
-        ours = [v for v in self.variants if (v.env, v.family) == (env, family)]
-        found = {v.method: v for v in ours if v.tag == tag}
+        found = self.tagged(env, family, tag)
         if fall_back and found:
-            found = {v.method: v for v in ours if v.tag is None} | found
+            found = self.tagged(env, family, None) | found
         return {name: found[name] for name in FAMILIES[family] if name in found}
