@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from bcrl import pack
+from bcrl import pack, runner
 from bcrl.api import DQN, FQI, Boost, Forest, Gymnasium, run, stages
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.rollout import draws, play, start_states
@@ -169,6 +169,33 @@ def test_all_variants_compose(env):
     made = plans(f"env={env}", "algorithm=dqn,fqi", variants, multirun=True)
     assert len({p.directory for p in made}) == 12
     assert not any(p.tag for p in made)
+
+
+@pytest.mark.parametrize("env", CURRICULA)
+def test_fqi_and_dqn_run_in_every_variant(env, tmp_path):
+    small = ("scale=smoke", "seeds.count=1", "env.horizon=12", f"runs_dir={tmp_path}")
+    small += ("scale.max_episodes=3", "env.starts=2", "progress=none", "tag=x")
+    own = {
+        "fqi": ("algorithm.regressor.trees=2",),
+        "dqn": ("scale.max_steps=30", "algorithm.learning_starts=10"),
+    }
+    own["dqn"] += ("algorithm.random_steps=5", "algorithm.evaluation_episodes=2")
+    made = [
+        each
+        for name, more in own.items()
+        for each in plans(
+            f"env={env}",
+            f"algorithm={name}",
+            "variant=plain,C,B,BC",
+            *small,
+            *more,
+            multirun=True,
+        )
+    ]
+    runner.run(*made)
+    names = {path.parent.name for path in tmp_path.glob(f"smoke/{env}/*/*.csv")}
+    variants = [f"{v}{a}@x" for a in ("FQI", "DQN") for v in ("", "C-", "B-", "BC-")]
+    assert names == set(variants)
 
 
 def test_an_id_of_the_command_names_the_folder():
