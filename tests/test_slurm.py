@@ -21,6 +21,7 @@ from tests import cluster
 from tests.conftest import plans
 
 SMALL = ("scale=smoke", "scale.max_iterations=20", "checkpoint_every=0.01", "tag=x")
+SMALL += ("algorithm.regressor.trees=150",)  # seconds a job: time to disturb it
 SWEEP = ("experiment=fig2", *SMALL)
 PROGRAM = "import sys; from bcrl.cli import main; sys.argv[0] = 'bcrl'; main()"
 LIMIT = 120.0  # seconds in which anything waited for has to happen
