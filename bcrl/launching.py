@@ -117,15 +117,16 @@ class Slurm(SlurmLauncher):
         with guard.unregistered():
             state = Singleton.get_state()
         rows = [(job, "hydra.sweep.dir", n, "", state) for n, job in enumerate(jobs)]
-        arrays = []
-        for first in range(0, len(rows), ARRAY):
-            columns = zip(*rows[first : first + ARRAY], strict=True)
-            submitted = executor.map_array(self, *columns)
-            arrays.append(submitted[0].job_id.partition("_")[0])
-        if arrays:
-            count = f"{len(jobs)} job{'s' * (len(jobs) > 1)}"
-            say(f"Slurm: {count} as {' '.join(arrays)}; logs in {folder}")
-            _wait(arrays, self.config.progress != "none")
+        arrays, stop = [], Stop()
+        with stop.on_signals(second_ends_all=True):
+            for first in range(0, len(rows), ARRAY):
+                columns = zip(*rows[first : first + ARRAY], strict=True)
+                submitted = executor.map_array(self, *columns)
+                arrays.append(submitted[0].job_id.partition("_")[0])
+            if arrays:
+                count = f"{len(jobs)} job{'s' * (len(jobs) > 1)}"
+                say(f"Slurm: {count} as {' '.join(arrays)}; logs in {folder}")
+                _wait(arrays, self.config.progress != "none", stop)
         return []
 
     def __call__(self, *arguments: Any) -> NoReturn:
@@ -145,23 +146,22 @@ class Slurm(SlurmLauncher):
         sys.exit(code)  # nobody waits for a result
 
 
-def _wait(arrays: Sequence[str], telling: bool) -> None:
+def _wait(arrays: Sequence[str], telling: bool, stop: Stop) -> None:
     """Until none of the arrays has a job waiting or running; a signal interrupts."""
-    stop, pause, before = Stop(), 1.0, ""
-    with stop.on_signals(second_ends_all=True):
-        while not stop.asked:
-            listed = _squeue("--me", "--array", "--format=%F %T")
-            if listed is not None:
-                jobs = [line.split() for line in listed.splitlines()]
-                states = Counter(state for array, state in jobs if array in arrays)
-                if not states:
-                    return
-                now = ", ".join(f"{n} {s.lower()}" for s, n in sorted(states.items()))
-                pause = 1.0 if now != before else min(30.0, 1.2 * pause)
-                if telling and now != before:
-                    say(f"Slurm: {now}")
-                before = now
-            time.sleep(pause)
+    pause, before = 1.0, ""
+    while not stop.asked:
+        listed = _squeue("--me", "--array", "--format=%F %T")
+        if listed is not None:
+            jobs = [line.split() for line in listed.splitlines()]
+            states = Counter(state for array, state in jobs if array in arrays)
+            if not states:
+                return
+            now = ", ".join(f"{n} {s.lower()}" for s, n in sorted(states.items()))
+            pause = 1.0 if now != before else min(30.0, 1.2 * pause)
+            if telling and now != before:
+                say(f"Slurm: {now}")
+            before = now
+        time.sleep(pause)
     say(f"bcrl: Slurm goes on with it; `scancel {' '.join(arrays)}` ends it")
     raise Interrupted
 
