@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from bcrl import probes
 from bcrl.composition import placed
-from bcrl.envs import Env, is_simulated
+from bcrl.envs import Env, check_tasks, is_simulated
 from bcrl.envs.car_on_hill import CarOnHill
 from bcrl.envs.gymnasium import Gymnasium
 from bcrl.envs.linear_system import LinearSystem
@@ -76,24 +76,54 @@ def stages(
     """
     transfers = transfers or (warm_start,)
     learners = [learner] * len(tasks) if hasattr(learner, "learn") else learner
-    if not tasks or len(learners) != len(tasks):
-        why = f"there are {len(learners)} learners for {len(tasks)} tasks"
-        raise ConfigError("stages", "tasks", why)
+    _check(tasks, learners, transfers)
     different = list(dict.fromkeys(tasks))
-    if is_simulated(tasks[-1]):
-        tasks[-1].check_tasks(different)
     made = []
     for number, (task, own) in enumerate(zip(tasks, learners, strict=True), start=1):
         if isinstance(own, DQN) and number > 1 and hands_on_a_policy(transfers):
             own = replace(own, random_steps=0)
-        steering = [
-            t for t in transfers if isinstance(t, (PolicyReuse, ResidualPolicy))
-        ]
-        if isinstance(own, FQI) and steering:
-            why = "steers step by step, FQI learns from whole episodes"
-            raise ConfigError("stages", steering[0], why)
         made.append(Stage(number, different.index(task) + 1, task, own, transfers, 0))
     return placed(made)
+
+
+def _check(
+    tasks: Sequence[Env], learners: Sequence[Learner], transfers: Sequence[Transfer]
+) -> None:
+    """Raise ConfigError for what `stages` can't make a course of."""
+
+    def wrong(what: object, why: str) -> ConfigError:
+        return ConfigError("stages", what, why)
+
+    if not tasks or len(learners) != len(tasks):
+        raise wrong(f"{len(tasks)} tasks", f"there are {len(learners)} learners")
+    target, fitted = tasks[-1], isinstance(learners[-1], FQI)
+    for own in learners:
+        if not hasattr(own, "learn") or isinstance(own, FQI) != fitted:
+            raise wrong(own, "a course has learners of one family, FQI or DQN")
+        regressor = getattr(own, "regressor", None)
+        if fitted and (isinstance(regressor, type) or not hasattr(regressor, "fit")):
+            raise wrong(regressor, "is no regressor")
+        if fitted and not hasattr(regressor, "finite_only"):
+            why = "is no regressor of bcrl's; Sklearn(estimator) makes one of it"
+            raise wrong(regressor, why)
+    for transfer in transfers:
+        steers = isinstance(transfer, (PolicyReuse, ResidualPolicy))
+        if isinstance(transfer, type):
+            raise wrong(transfer.__name__, f"is a class, write {transfer.__name__}()")
+        if steers and fitted:
+            raise wrong(transfer, "steers step by step, FQI learns from whole episodes")
+        combines = isinstance(transfer, ResidualPolicy)
+        if combines and getattr(target, "actions", None) is None:
+            raise wrong(
+                transfer, f"combines actions as vectors, {target.name} has none"
+            )
+    for task in tasks:
+        if (task.state_dim, task.n_actions) != (target.state_dim, target.n_actions):
+            raise wrong(task, "has other states or actions than the target")
+    others = [task for task in dict.fromkeys(tasks) if task != target]
+    if {is_simulated(task) for task in tasks} != {is_simulated(target)}:
+        raise wrong(target, "simulators and pure environments don't mix")
+    check_tasks(target.name, [*others, target])
 
 
 def run(
@@ -109,7 +139,7 @@ def run(
     of docs/metrics.md (DQN). Seeds have the same results in any company. Raises
     BcrlError for seeds that diverge.
     """
-    seeds, target = tuple(seeds), course[-1].env
+    seeds, target = _seeds(seeds), course[-1].env
     tasks = [*dict.fromkeys(s.env for s in course if s.env != target), target]
     if isinstance(course[-1].learner, FQI):
         probes.check(metrics, target)
@@ -125,6 +155,15 @@ def run(
             bar.set_description_str(f"task {now.stage.task}", refresh=False)
             bar.update(now.count - bar.n)
     return pd.DataFrame(rows)
+
+
+def _seeds(seeds: Iterable[int]) -> tuple[int, ...]:
+    if isinstance(seeds, int):
+        raise ConfigError("seeds", seeds, f"name them: range({seeds}) or [{seeds}]")
+    found = tuple(seeds)
+    if not found or len(set(found)) < len(found) or min(found) < 0:
+        raise ConfigError("seeds", found, "must be different numbers from 0 on")
+    return found
 
 
 def _rows(now: Snapshot, probe: probes.Probe | StepProbe, seeds: Sequence[int]) -> list:

@@ -16,7 +16,7 @@ from bcrl import probes
 from bcrl.algorithms import algorithm
 from bcrl.composition import Composition, composition
 from bcrl.config import Choice, Config, construct, one_of
-from bcrl.envs import Env, is_simulated
+from bcrl.envs import Env, check_tasks
 from bcrl.errors import ConfigError, at_least, did_you_mean
 from bcrl.identity import Plain, differences
 from bcrl.loggers import logger
@@ -190,8 +190,7 @@ def _check_outputs(config: Plain) -> None:
 def _tasks(section: Plain) -> tuple[list[Env], tuple[str, ...]]:
     """The environment's tasks, easiest first, and the metrics to record."""
     tasks = tasks_of(section)
-    if is_simulated(tasks[-1]):
-        tasks[-1].check_tasks(tasks)
+    check_tasks(section["name"], tasks)
     metrics = section.get("metrics")
     if not isinstance(metrics, list) or not metrics:
         raise ConfigError("env.metrics", metrics, "must be a list of metric names")

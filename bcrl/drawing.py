@@ -93,8 +93,9 @@ def draw(
     The last state is the present one; `action`, a number or a force (k,), is what
     is done in it. `caption` stands below the picture.
     """
-    known = action is not None and np.ndim(action) == 0 and env.actions is not None
-    force = env.actions[action] if known else action
+    vectors = getattr(env, "actions", None)
+    known = action is not None and np.ndim(action) == 0 and vectors is not None
+    force = vectors[action] if known else action
     canvas = _drawing(env)[0](env, np.asarray(path, float), force)
     canvas.text(12, SIZE - 10, caption, "ld")
     return canvas.picture()

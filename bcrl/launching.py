@@ -27,6 +27,7 @@ from hydra_plugins.hydra_submitit_launcher.submitit_launcher import SlurmLaunche
 from omegaconf import DictConfig
 
 from bcrl import compose, guard, records, vetting
+from bcrl.errors import ConfigError
 from bcrl.interrupts import EXIT_CODE, Interrupted, Stop
 from bcrl.terminal import say
 from bcrl.workers import cores
@@ -41,8 +42,8 @@ class Local(JoblibLauncher):
     def __init__(
         self, n_jobs: int | None = None, seeds_per_job: int | None = None, **rest: Any
     ) -> None:
-        super().__init__(n_jobs=n_jobs, **rest)
-        self.seeds_per_job = seeds_per_job
+        super().__init__(n_jobs=_count("n_jobs", n_jobs), **rest)
+        self.seeds_per_job = _count("seeds_per_job", seeds_per_job)
 
     def launch(self, job_overrides: Jobs, initial_job_idx: int) -> Sequence:
         jobs = _divided(self, job_overrides, self.seeds_per_job)
@@ -59,7 +60,8 @@ class Local(JoblibLauncher):
             try:
                 return super().launch(jobs, initial_job_idx)
             except BrokenExecutor as error:
-                say(f"bcrl: a process died, all jobs have ended: {error}")
+                if not stop.asked:
+                    say(f"bcrl: a process died, all jobs have ended: {error}")
                 return []
             finally:
                 if stop.asked:
@@ -96,7 +98,7 @@ class Slurm(SlurmLauncher):
 
     def __init__(self, seeds_per_job: int | None = None, **params: Any) -> None:
         super().__init__(**params)
-        self.seeds_per_job = seeds_per_job
+        self.seeds_per_job = _count("seeds_per_job", seeds_per_job)
         self.argv = sys.argv
 
     def launch(self, job_overrides: Jobs, initial_job_idx: int) -> Sequence:
@@ -171,6 +173,14 @@ def _squeue(*options: str) -> str | None:
     command = ["squeue", "--noheader", *options]
     done = subprocess.run(command, capture_output=True, text=True)
     return done.stdout.strip() if done.returncode == 0 else None
+
+
+def _count(key: str, value: object) -> int | None:
+    """A number of at least 1, or None; ConfigError for anything else."""
+    if value is None or (type(value) is int and value >= 1):
+        return value
+    why = "must be a number of at least 1, or null"
+    raise ConfigError(f"hydra.launcher.{key}", value, why)
 
 
 def _divided(launcher: Local | Slurm, jobs: Jobs, size: int | None) -> list[list[str]]:

@@ -18,6 +18,7 @@ from bcrl.progress import named
 
 COMPLETE, RUNNING, FAILED = "complete", "running", "failed"  # as in a seed's JSON
 INTERRUPTED, WAITING = "interrupted", "waiting"
+MOST = 10**6  # seeds in one range; a config can't ask for more
 STATES = (COMPLETE, RUNNING, INTERRUPTED, FAILED, WAITING)
 
 
@@ -102,9 +103,14 @@ def _ever_asked(directory: Path) -> list[int]:
     """The seeds that a variant's folder was ever asked for, by what those begun say."""
     seeds: set[int] = set()
     for path in directory.glob("seed_*.json"):
-        facts = records.read_facts(directory, int(path.stem.partition("_")[2]))
-        for first, last in facts.get("asked", ()):
-            seeds.update(range(first, last + 1))
+        number = path.stem.partition("_")[2]
+        if not number.isdecimal():
+            continue  # somebody else's; bcrl-verify tells
+        try:
+            for first, last in records.read_facts(directory, int(number))["asked"]:
+                seeds.update(range(first, min(last, first + MOST) + 1))
+        except records.MALFORMED:
+            continue
     return sorted(seeds)
 
 
@@ -116,7 +122,7 @@ def _look(directory: Path, seeds: Sequence[int], seconds: float = math.nan) -> A
     facts = {seed: records.read_facts(directory, seed) for seed in seeds}
     states = {seed: _state(directory, seed, facts[seed]) for seed in seeds}
     failed = {s: facts[s]["status"] for s in seeds if states[s] == FAILED}
-    spent = [facts[s]["cpu_seconds"] for s in seeds if states[s] == COMPLETE]
+    spent = [facts[s].get("cpu_seconds", 0) for s in seeds if states[s] == COMPLETE]
     begun = checkpoints.shares(directory)
     left = [s for s in seeds if states[s] not in (COMPLETE, FAILED)]
     undone = sum(1.0 - begun.get(seed, 0.0) for seed in left)

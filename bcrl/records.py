@@ -26,7 +26,7 @@ from bcrl.locks import waited_for
 
 SCHEMA = 2  # raised when a file's meaning changes
 MALFORMED = (ValueError, LookupError, TypeError, AttributeError)  # what a file may be
-LIBRARIES = ("hydra-core", "numpy", "numba", "scikit-learn", "torch")
+LIBRARIES = ("hydra-core", "numpy", "numba", "scikit-learn", "torch", "gymnasium")
 
 
 def check_directory(plan: Plan) -> None:

@@ -66,8 +66,9 @@ def start_states(
 
 def evaluation_starts(rng: np.random.Generator, env: Env) -> NDArray[np.float64]:
     """Where FQI's greedy policy is evaluated from: set states, or random ones."""
-    states = env.evaluation_states()
-    return start_states(rng, env, len(states)) if is_simulated(env) else states
+    if is_simulated(env):
+        return start_states(rng, env, env.starts)
+    return env.evaluation_states()
 
 
 def success_of(env: Env) -> str:

@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 import textwrap
+import time
 from argparse import Namespace
 from contextlib import redirect_stderr
 from pathlib import Path
@@ -18,6 +19,7 @@ from bcrl.errors import BcrlError, guess
 
 HELP = PACKAGE / "help.txt"
 WIDTH, HANGING = 88, 21  # columns of the help, and where an option's text begins
+STARTED = "BCRL_STARTED"  # when the command began: a debug run's folder
 LINE = "COMP_LINE"  # the environment variable with the line that Tab is to complete
 
 
@@ -27,6 +29,7 @@ def arguments() -> Namespace:
     `sys.argv` is put into the order that Hydra wants, flags first; people write them
     anywhere. A folder of configs that isn't named is the user's own, if there is one.
     """
+    os.environ.setdefault(STARTED, time.strftime("%Y-%m-%d_%H-%M-%S"))
     flags = parser()
     asked, unknown = flags.parse_known_intermixed_args()
     if unknown:

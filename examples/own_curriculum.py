@@ -11,7 +11,7 @@ from bcrl.api import FQI, Boost, Forest, Gymnasium, run, stages
 
 forces = (0.005, 0.003, 0.0018, 0.001)  # the last is MountainCar-v0's own
 tasks = [
-    Gymnasium("MountainCar-v0", attributes={"force": force}, starts=10)
+    Gymnasium("MountainCar-v0", attributes={"force": force}, starts=5)
     for force in forces
 ]
 learner = FQI(iterations=8, episodes=100, epsilon=0.3, regressor=Forest(trees=20))
@@ -21,7 +21,7 @@ methods = {
     "BC-FQI": stages(tasks, learner, Boost()),
 }
 frames = {
-    name: run(each, seeds=range(3), progress=False) for name, each in methods.items()
+    name: run(each, seeds=range(2), progress=False) for name, each in methods.items()
 }
 results = pd.concat(frames, names=["method", "row"])
 

@@ -1,5 +1,8 @@
 """Gymnasium's environments as tasks: same episodes, kept apart, replayed, checked."""
 
+import itertools
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -15,14 +18,18 @@ CAR = {"id": "MountainCar-v0", "horizon": 40}
 CURRICULA = ("mountain_car", "cart_pole", "acrobot")
 
 
+MOODS = itertools.count()
+
+
 class Counter(gymnasium.Env):
     """Counts its steps; `prize` at 5; truncates itself at 3 if told so."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
     action_space = gymnasium.spaces.Discrete(2, start=7)
 
-    def __init__(self, stop=False, prize=1.0, broken=False):
+    def __init__(self, stop=False, prize=1.0, broken=False, moody=False, sums=(0,)):
         self.stop, self.prize, self.broken, self.own = stop, prize, broken, 2.0
+        self.moody, self.sums = moody, sums
 
     def reset(self, seed=None, options=None):
         super().reset(seed=seed)
@@ -32,8 +39,12 @@ class Counter(gymnasium.Env):
     def step(self, action):
         assert self.action_space.contains(action)
         self.steps += 1
+        if isinstance(self.sums, list):
+            self.sums[0] += 1.0
         end, cut = self.steps == 5, self.stop and self.steps == 3
         seen = np.full(1, np.nan if self.broken else self.steps, np.float32)
+        if self.moody:
+            seen += next(MOODS)
         return seen, self.prize * end, end, cut, {}
 
 
@@ -137,16 +148,31 @@ def test_lanes_out_of_a_checkpoint_go_on_in_the_middle_of_an_episode(tmp_path):
 
 
 def test_a_parameter_that_is_not_applied_is_found():
-    one, other = ([{"LINK_LENGTH_2": x} for x in pair] for pair in ((1, 2), (1, 1)))
-    for attributes in (one, other):  # Gymnasium's dynamics use the centre of mass only
+    for lengths in ((1.0, 2.0), (1.0, 1.0)):  # the dynamics use the centre of mass
+        attributes = [{"LINK_LENGTH_2": length} for length in lengths]
         tasks = [Gymnasium("Acrobot-v1", attributes=a) for a in attributes]
-        if attributes is one:
-            with pytest.raises(ConfigError, match="behave alike"):
-                Gymnasium.check_tasks(tasks)
-        else:
-            Gymnasium.check_tasks(tasks)  # the same task twice is meant
-    unchecked = [Gymnasium("Acrobot-v1", attributes=a, verify=False) for a in one]
-    Gymnasium.check_tasks(unchecked)
+        with pytest.raises(ConfigError, match="behave alike"):
+            Gymnasium.check_tasks(tasks)
+        Gymnasium.check_tasks([replace(task, verify=False) for task in tasks])
+
+
+def test_randomness_that_a_reset_does_not_seed_is_found():
+    with pytest.raises(ConfigError, match="same reset and actions"):
+        plans("env=gymnasium", "env.id=tests/Counter-v0", "env.kwargs={moody: true}")
+
+
+def test_a_simulator_has_its_constants_to_itself():
+    task = Gymnasium("tests/Counter-v0", kwargs={"sums": [0.0]})
+    lanes = task.lanes()
+    lanes.begin(np.full((2, 1), 0.5))
+    lanes.step(None, np.zeros(2, int), None)
+    assert [lane.unwrapped.sums for lane in lanes.running] == [[1.0], [1.0]]
+    assert task.kwargs == {"sums": [0.0]}
+
+
+def test_equal_tasks_have_equal_hashes():
+    one, other = (Gymnasium(**CAR, attributes={"force": f}) for f in (1, 1.0))
+    assert one == other and hash(one) == hash(other)
 
 
 @pytest.mark.parametrize("env", CURRICULA)
@@ -225,6 +251,14 @@ BAD = {
     "a hidden attribute": (["env.attributes={_np_random: 2}"], "_np_random"),
     "no plain attribute": (["env.attributes={action_space: 2}"], "action_space"),
     "text for a number": (["env.attributes={prize: x}"], "must be like 1.0"),
+    "nothing for a number": (["env.attributes={prize: null}"], "must be like 1.0"),
+    "a list for a number": (["env.attributes={prize: [1, 2]}"], "must be like 1.0"),
+    "no finite number": (["env.attributes={prize: nan}"], "must be finite"),
+    "a horizon of 0": (["env.horizon=0"], "env.horizon=0"),
+    "a wrapper that can't": (
+        ["env.wrappers=[{name: FrameStackObservation, stack_size: 0}]"],
+        "env.wrappers.FrameStackObservation",
+    ),
     "a reset attribute": (["env.attributes={own: 3.0}"], "again after a reset"),
     "an unknown wrapper": (["env.wrappers=[{name: RecordVideo}]"], "known:"),
     "a nameless wrapper": (["env.wrappers=[StickyAction]"], "needs a name"),

@@ -16,6 +16,7 @@ RESULTS = {
     "curriculum=in_pairs": ("BC-FQI@pairs",),
     "transfer=fade": ("Fade-C-FQI",),
     "algorithm=patient": ("BC-PATIENT",),
+    "logger=lines": ("BC-FQI",),
 }
 
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Sequence
 
 from bcrl import trust
+from bcrl.envs import _protocol
 from bcrl.envs.base import Env, FiniteEnv, is_finite, is_simulated, lanes_of
 from bcrl.errors import BcrlError, did_you_mean
 
 __all__ = [
     "Env",
     "FiniteEnv",
+    "check_tasks",
     "env_class",
     "env_names",
     "is_finite",
@@ -24,6 +27,18 @@ def env_names() -> list[str]:
     """Names of the environments that this package ships."""
     found = (module.name for module in pkgutil.iter_modules(__path__))
     return [name for name in found if name != "base" and not name.startswith("_")]
+
+
+def check_tasks(name: str, tasks: Sequence[Env]) -> None:
+    """Raise ConfigError for tasks that no learner could do with.
+
+    Pure environments of this package are tested, the user's own are tried.
+    """
+    if is_simulated(tasks[-1]):
+        tasks[-1].check_tasks(tasks)
+    elif name not in env_names():
+        for task in tasks:
+            _protocol.check(name, task)
 
 
 def env_class(name: str) -> type:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+import copy
 import inspect
 import warnings
 from collections.abc import Mapping, Sequence
@@ -60,6 +60,8 @@ def made(
 ) -> gymnasium.Env:
     """The environment, without a time limit; ConfigError for what it doesn't take."""
     spec = spec_of(name)
+    # Each simulator has its own: whoever changes a list changes no other's.
+    kwargs, attributes, wrappers = copy.deepcopy((kwargs, attributes, wrappers))
     _check_arguments("env.kwargs", kwargs, _creator(spec))
     with warnings.catch_warnings():  # of precision and of old versions, each time
         warnings.simplefilter("ignore", UserWarning)
@@ -87,7 +89,7 @@ def _check_arguments(key: str, arguments: Mapping, made: Any, first: int = 0) ->
         if argument in OURS:
             raise ConfigError(f"{key}.{argument}", value, "is set by bcrl")
         if argument not in known and not anything:
-            why = did_you_mean(argument, known) or "it takes no arguments"
+            why = did_you_mean(argument, known) if known else "it takes no arguments"
             raise ConfigError(f"{key}.{argument}", value, why)
 
 
@@ -103,13 +105,17 @@ def _set(env: gymnasium.Env, key: str, value: Any) -> None:
     if key not in known:
         raise ConfigError(f"env.attributes.{key}", value, did_you_mean(key, known))
     before = getattr(there, key)
+    kinds = (bool, str, (int, float, np.number), (list, tuple, np.ndarray))
+    kind = next(k for k in kinds if isinstance(before, k))
+    boolean = isinstance(value, bool) != (kind is bool)
+    if boolean or not isinstance(value, kind) or np.shape(value) != np.shape(before):
+        raise ConfigError(f"env.attributes.{key}", value, f"must be like {before!r}")
+    if kind is not str and not np.isfinite(value).all():
+        raise ConfigError(f"env.attributes.{key}", value, "must be finite")
     if isinstance(before, np.ndarray):
-        value = np.asarray(value, before.dtype)
-    elif isinstance(before, float) and isinstance(value, int):
+        value = np.array(value, before.dtype)
+    elif isinstance(before, float):
         value = float(value)
-    if isinstance(value, str) != isinstance(before, str):
-        why = f"must be like {before!r}"
-        raise ConfigError(f"env.attributes.{key}", value, why)
     setattr(there, key, value)
     env.reset(seed=0)
     if not np.array_equal(getattr(there, key), value):
@@ -139,7 +145,11 @@ def _wrapped(env: gymnasium.Env, wrapper: Any) -> gymnasium.Env:
         why = f"{did_you_mean(name, WRAPPERS)}, or module.Wrapper of your own"
         raise ConfigError("env.wrappers", name, why)
     _check_arguments(f"env.wrappers.{name}", arguments, cls.__init__, 2)
-    return cls(env, **arguments)
+    try:
+        return cls(env, **arguments)
+    except Exception as error:  # whatever a wrapper does
+        why = f"can't wrap it: {type(error).__name__}: {error}"
+        raise ConfigError(f"env.wrappers.{name}", arguments, why) from error
 
 
 @storable
@@ -215,13 +225,22 @@ class SimulatedLanes:
 
     def _reset(self, lane: int) -> NDArray[np.float64]:
         seed = int(self.start.reshape(-1)[lane] * 2**53)
-        return self.env.observed(self.running[lane].reset(seed=seed)[0])
+        try:
+            return self.env.observed(self.running[lane].reset(seed=seed)[0])
+        except Exception as error:
+            text = f"a reset failed: {type(error).__name__}: {error}"
+            raise BcrlError(f"env.id={self.env.id}: {text}") from error
 
     def _act(self, lane: int, action: int) -> tuple:
-        simulator = self.running[lane]
-        return simulator.step(action + _first_action(simulator))
+        try:
+            return self.running[lane].step(action + self.env.first_action)
+        except Exception as error:  # whatever a foreign environment does
+            text = f"a step failed: {type(error).__name__}: {error}"
+            raise BcrlError(f"env.id={self.env.id}: {text}") from error
 
     def _make(self) -> None:
+        for simulator in self.running:
+            simulator.close()
         count, mode = self.length.size, self.render_mode
         self.running = [self.env.simulator(mode) for _ in range(count)]
 
@@ -240,8 +259,3 @@ class SimulatedLanes:
         if not all(np.isfinite(values).all() for values in found):
             text = "gave an observation or reward that is not finite"
             raise BcrlError(f"env.id={self.env.id}: {text}")
-
-
-@functools.lru_cache(maxsize=4096)
-def _first_action(simulator: gymnasium.Env) -> int:
-    return int(simulator.action_space.start)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
@@ -104,8 +105,13 @@ class SimulatedEnv(Env, Protocol):
     simulator's own, from the reset on.
     """
 
+    starts: int  # random resets that FQI's greedy policy is evaluated from
+
     def lanes(self) -> Lanes:
         """Simulators to be stepped side by side."""
+
+    def check_tasks(self, tasks: Sequence[Env]) -> None:
+        """Raise ConfigError for tasks that can't follow each other."""
 
 
 @storable

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
@@ -68,10 +67,12 @@ class Gymnasium:
             if not isinstance(value, (kind, type(None))):
                 noun = "names and values" if kind is dict else "a list of sections"
                 raise ConfigError(f"env.{key}", value, f"must be {noun}, or null")
-        horizon = self.horizon or simulators.max_steps(self.id)
-        if type(horizon) is not int:
+        horizon = self.horizon
+        if horizon is None and (horizon := simulators.max_steps(self.id)) is None:
             why = f"is needed: {self.id} has no limit of its own (a number of steps)"
-            raise ConfigError("env.horizon", self.horizon, why)
+            raise ConfigError("env.horizon", None, why)
+        if type(horizon) is not int:
+            raise ConfigError("env.horizon", horizon, "must be an integer, or null")
         object.__setattr__(self, "horizon", horizon)
         check_episodes(self.gamma, horizon)
         space = self._simulator.action_space
@@ -109,7 +110,7 @@ class Gymnasium:
             raise ConfigError("env.action_vectors", self.action_vectors, why)
 
     def __hash__(self) -> int:
-        return hash(json.dumps(_fields(self), sort_keys=True, default=str))
+        return hash((self.id, self.horizon, self.gamma))  # dicts have none
 
     def __reduce__(self) -> tuple:
         return _made, (_fields(self),)  # what is cached stays here
@@ -124,6 +125,11 @@ class Gymnasium:
     def n_actions(self) -> int:
         """Actions, 0 … n − 1."""
         return int(self._simulator.action_space.n)
+
+    @functools.cached_property
+    def first_action(self) -> int:
+        """What the simulator calls action 0."""
+        return int(self._simulator.action_space.start)
 
     @functools.cached_property
     def state_dim(self) -> int:
@@ -153,9 +159,10 @@ class Gymnasium:
             for action in actions:
                 lanes.step(None, action[None], None)
                 yield lanes.running[0].render()
-        except (gymnasium.error.Error, TypeError) as error:
+        except (gymnasium.error.Error, NotImplementedError, TypeError) as error:
             text = "pip install 'boosted-curriculum-rl[rendering]' may be what it needs"
-            raise BcrlError(f"{self.id} draws nothing: {error}; {text}") from error
+            why = f"{type(error).__name__} {error}".strip()
+            raise BcrlError(f"{self.id} draws nothing ({why}); {text}") from error
 
     def observed(self, observation: Any) -> NDArray[np.float64]:
         """An observation as a vector (d,)."""
@@ -193,38 +200,56 @@ class Gymnasium:
                     why += "a function env.observation can make them equal"
                     raise ConfigError("env.tasks", what, why)
             after = tasks[number]
-            if task != after and target.verify and not differ(task, after):
+            if target.verify and not differ(task, after):
                 why = f"tasks {number} and {number + 1} behave alike in {TRIES} "
                 why += "episodes of random play, so what differs may not be applied "
                 why += "(env.verify=false if that is as it should be)"
                 raise ConfigError("env.tasks", _difference(task, after), why)
+        for number, task in enumerate(tasks, start=1):
+            if task.verify and not repeats(task):
+                why = f"task {number} is another after the same reset and actions; "
+                why += "its randomness must come from reset(seed=…)"
+                raise ConfigError("env.id", task.id, why)
+
+
+@functools.lru_cache(maxsize=256)
+def repeats(task: Gymnasium) -> bool:
+    """Whether the first steps of an episode are the same a second time."""
+    return not _play_apart(task, task, min(50, task.horizon))
 
 
 @functools.lru_cache(maxsize=256)
 def differ(one: Gymnasium, other: Gymnasium) -> bool:
     """Whether two tasks lead anywhere else under the same resets and actions."""
+    if one == other:
+        return False
     if one.horizon != other.horizon or one.gamma != other.gamma:
         return True
+    return _play_apart(one, other, one.horizon)
+
+
+def _play_apart(one: Gymnasium, other: Gymnasium, steps: int) -> bool:
+    """Whether anything differs in so many steps of random play."""
     start = (np.arange(TRIES)[:, None] + 0.5) / TRIES
-    actions = np.random.default_rng(0).integers(
-        one.n_actions, size=(one.horizon, TRIES)
-    )
+    actions = np.random.default_rng(0).integers(one.n_actions, size=(steps, TRIES))
     pair = [task.lanes() for task in (one, other)]
     begun = [lanes.begin(start) for lanes in pair]
     if not np.array_equal(*begun):
         return True
     alive = np.ones(TRIES, bool)
     for action in actions:
-        (*a, cut), (*b, _) = (x.step(None, action[alive], None, alive) for x in pair)
+        a, b = (x.step(None, action[alive], None, alive) for x in pair)
         if not all(map(np.array_equal, a, b)):
             return True
-        alive[alive] = ~(a[2] | cut)
+        alive[alive] = ~(a[2] | a[3])
         if not alive.any():
             break
     return False
 
 
 def _difference(one: Gymnasium, other: Gymnasium) -> str:
+    if one == other:
+        return "the same twice"
     a, b = _fields(one), _fields(other)
     return ", ".join(f"{key}: {a[key]} → {b[key]}" for key in a if a[key] != b[key])
 

@@ -73,7 +73,8 @@ class FQI:
         )
         # With noise no state comes twice; the next stage's base should not remember.
         noisy = env.step_noise or is_simulated(env)
-        evaluated = start if noisy else start.remembered()
+        pointwise = getattr(self.regressor, "pointwise", False)
+        evaluated = start.remembered() if pointwise and not noisy else start
         for k in range(done + 1, self.iterations + 1):
             residual = [values.copy() for values in residual]
             problems = self._problems(stage, k, team, rewards, sets, base, residual)

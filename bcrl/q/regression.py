@@ -48,6 +48,8 @@ class Regressor(Protocol):
     """Fits many problems at once; constructor arguments are its YAML keys.
 
     `finite_only`: whether it needs an environment with finitely many states.
+    `pointwise`, if it says so: no prediction depends, to the last bit, on what else is
+    asked, so that it may be remembered.
     """
 
     finite_only: bool

@@ -24,6 +24,7 @@ class ForestRegressor:
     min_samples_split: int = 5
     min_samples_leaf: int = 2
     finite_only = False
+    pointwise = True
 
     def __post_init__(self) -> None:
         at_least("algorithm.regressor.trees", self.trees, 1)

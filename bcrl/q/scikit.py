@@ -6,12 +6,12 @@ import functools
 import importlib
 import inspect
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from bcrl.errors import ConfigError, at_least, did_you_mean
 from bcrl.q.regression import Fit, Problem
@@ -31,8 +31,8 @@ class _Fitting:
     def fit(self, problems: Sequence[Problem], keep: bool, threads: int) -> list[Fit]:
         """Fits, in order, each with a seed of its own."""
         seeds = [int(p.rng.integers(2**31)) for p in problems]
-        with ThreadPoolExecutor(threads) as pool:
-            return list(pool.map(self._fit_one, problems, seeds))
+        with threadpool_limits(1):  # sums would depend on the number of threads
+            return list(map(self._fit_one, problems, seeds))
 
     def _fit_one(self, problem: Problem, seed: int) -> Fit:
         model = self._model(seed)
@@ -45,7 +45,8 @@ class _Fitting:
         self, models: Sequence[Any], x: Sequence[NDArray], threads: int
     ) -> list[NDArray[np.float64]]:
         """Each model's predictions (n,) at its own points (n, d)."""
-        return [np.float64(m.predict(p)) for m, p in zip(models, x, strict=True)]
+        with threadpool_limits(1):
+            return [np.float64(m.predict(p)) for m, p in zip(models, x, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -58,11 +59,19 @@ class Sklearn(_Fitting):
     """
 
     estimator: Any
-    arguments: dict = field(default_factory=dict)
+    arguments: Any = None
     standardise: bool = False
 
     def __post_init__(self) -> None:
-        self._model(0)
+        if not isinstance(self.arguments, (dict, type(None))):
+            why = "must be names and values, or null"
+            raise ConfigError("algorithm.regressor.arguments", self.arguments, why)
+        try:
+            self._model(0)
+        except (TypeError, ValueError) as error:
+            place = "algorithm.regressor.arguments"
+            why = " ".join(str(error).split())
+            raise ConfigError(place, self.arguments, why) from error
 
     def _model(self, seed: int) -> Any:
         from sklearn.base import clone
@@ -71,13 +80,15 @@ class Sklearn(_Fitting):
 
         named = isinstance(self.estimator, str)
         made = _class(self.estimator)() if named else clone(self.estimator)
-        known = made.get_params()
-        for key, value in self.arguments.items():
+        known, arguments = made.get_params(), self.arguments or {}
+        for key, value in arguments.items():
             if key not in known:
                 place = f"algorithm.regressor.arguments.{key}"
                 raise ConfigError(place, value, did_you_mean(key, known))
         states = {k: seed for k in known if k.split("__")[-1] == "random_state"}
-        made.set_params(**states | self.arguments)
+        made.set_params(**states | arguments)
+        if hasattr(made, "_validate_params"):  # else it would wait for the first fit
+            made._validate_params()
         return make_pipeline(StandardScaler(), made) if self.standardise else made
 
 

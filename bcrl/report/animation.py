@@ -39,6 +39,8 @@ def animations(
             files.append(_write(path, *zip(*shown, strict=True)))
         except BcrlError as error:
             skipped.append(f"{path.name}: {error}")
+        except Exception as error:  # whatever an environment of the user's does
+            skipped.append(f"{path.name}: {type(error).__name__}: {error}")
     return files, skipped
 
 

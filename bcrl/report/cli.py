@@ -128,8 +128,10 @@ def report(
         table = sweep_table(compared)
         files.append(_write_csv(out / f"sweep_{runs.scale}.csv", table))
     fallback = {
-        pair: [Picture(png, "Mean over seeds with 95 % intervals.")]
-        for pair, (png, _) in curves.items()
+        pair: [
+            Picture(png, "Mean over seeds with 95 % intervals.") for png in saved[::2]
+        ]
+        for pair, saved in curves.items()
     }
     agents = [
         Picture(path, f"{env_title(variant.env)}: {variant.name}")
@@ -144,17 +146,23 @@ def report(
 def draw_curves(
     runs: Runs, out: Path, tag: str | None
 ) -> dict[tuple[str, str], list[Path]]:
-    """Learning curves wherever the paper has no figure: (env, family) → PNG, PDF."""
-    suffix = f"{runs.scale}@{tag}" if tag else runs.scale
-    files = {}
+    """Learning curves wherever the paper has no figure: (env, family) → PNG, PDF, ….
+
+    Where there are tagged variants only, a figure a tag.
+    """
+    files: dict[tuple[str, str], list[Path]] = {}
     for env, family in runs.pairs:
-        if (env, family) in COMPARED or not runs.tagged(env, family, tag):
+        if (env, family) in COMPARED:
             continue
-        with style.sheet():
-            drawn = figure_curves(runs, env, family, tag)
-            title = f"{env}, {family}: learning curves, {suffix}"
-            name = f"curves_{env}_{family}_{suffix}"
-            files[env, family] = style.save(drawn, out, name, title)
+        tags = dict.fromkeys(variant.tag for variant in runs.of(env, family))
+        for shown in [tag] if tag in tags else tags if tag is None else ():
+            suffix = f"{runs.scale}@{shown}" if shown else runs.scale
+            with style.sheet():
+                drawn = figure_curves(runs, env, family, shown)
+                title = f"{env}, {family}: learning curves, {suffix}"
+                name = f"curves_{env}_{family}_{suffix}"
+                saved = style.save(drawn, out, name, title)
+            files.setdefault((env, family), []).extend(saved)
     return files
 
 

@@ -31,6 +31,12 @@ def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, 
     ours = {variant.name: variant for variant in main.values()}
     others = [name for name in found if name not in ours]
     dashes = {name: DASHES[0] for name, v in ours.items() if style.dashed(v.method)}
+    tags = list(dict.fromkeys(variant.tag for variant in ours.values()))
+    dashes |= {  # beside the first tag, the others need another look
+        name: DASHES[(tags.index(v.tag) - 1) % len(DASHES)]
+        for name, v in ours.items()
+        if v.tag != tags[0]
+    }
     dashes |= dict(zip(others, itertools.cycle(DASHES[1:]), strict=False))
     metrics = metrics_of(found)
     return {

@@ -1,0 +1,91 @@
+"""What an environment of the user's may get wrong is named before any work."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from bcrl.api import FQI, Boost, Forest, ResidualPolicy, Tabular, run, stages
+from bcrl.errors import ConfigError
+from tests.toys import OpenCorridor
+
+LEARNER = FQI(iterations=1, episodes=2, regressor=Forest(trees=2))
+
+
+def variant(**changes) -> OpenCorridor:
+    """The corridor with functions or numbers changed."""
+    return dataclass(frozen=True)(type("Mine", (OpenCorridor,), changes))()
+
+
+def step(self, state, action, noise=None, change=lambda *x: x):
+    return change(*OpenCorridor.step(self, state, action))
+
+
+def changed(change):
+    return {"step": lambda *a: step(*a, change=change)}
+
+
+WRONG = {
+    "other states": ({"state_dim": 2}, r"initial: the states have shape \(2, 3, 1\)"),
+    "no number": ({"initial_noise": None}, "initial_noise must be a number"),
+    "rewards with an axis": (
+        changed(lambda s, r, a: (s, r[..., None], a)),
+        r"rewards have shape \(2, 3, 1\), expected \(2, 3\)",
+    ),
+    "no booleans": (changed(lambda s, r, a: (s, r, {})), "absorbing have shape None"),
+    "numbers for booleans": (
+        changed(lambda s, r, a: (s, r, 1.0 * a)),
+        "must be booleans",
+    ),
+    "two values": (changed(lambda s, r, a: (s, r)), "step must give"),
+    "no reward": (changed(lambda s, r, a: (s, r * np.nan, a)), "not finite"),
+    "dice": (changed(lambda s, r, a: (s, r + next(DICE), a)), "comes in as noise"),
+    "an exception": ({"step": lambda *_: 1 / 0}, "step failed: ZeroDivisionError"),
+    "states in place": (
+        {"initial": lambda self, noise: np.add(noise, 1, out=noise)},
+        "changes its arguments",
+    ),
+}
+DICE = iter(range(100))
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_wrong_is_said(name):
+    changes, words = WRONG[name]
+    with pytest.raises(ConfigError, match=words):
+        stages([variant(**changes)], LEARNER)
+
+
+def test_an_environment_that_is_right_passes():
+    found = run(stages([variant()] * 2, LEARNER, Boost()), [0], progress=False)
+    assert list(found.stage) == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("tasks", "learner", "transfers", "words"),
+    [
+        ([], LEARNER, (), "0 tasks"),
+        ([OpenCorridor()], [LEARNER] * 2, (), "there are 2 learners"),
+        ([OpenCorridor()], LEARNER, (Boost,), r"write Boost\(\)"),
+        ([OpenCorridor()], LEARNER, (ResidualPolicy(),), "FQI learns from whole"),
+        ([OpenCorridor()], FQI(1, 1, Tabular), (), "is no regressor"),
+        ([OpenCorridor()], "FQI", (), "learners"),
+    ],
+)
+def test_stages_refuses_what_makes_no_sense(tasks, learner, transfers, words):
+    with pytest.raises(ConfigError, match=words):
+        stages(tasks, learner, *transfers)
+
+
+@pytest.mark.parametrize("seeds", [3, [], [0, 0], [-1]])
+def test_seeds_are_different_numbers(seeds):
+    with pytest.raises(ConfigError, match="seeds"):
+        run(stages([OpenCorridor()], LEARNER), seeds, progress=False)
+
+
+def test_an_estimator_of_scikit_learn_is_to_be_wrapped():
+    from sklearn.neighbors import KNeighborsRegressor
+
+    bare = FQI(iterations=1, episodes=1, regressor=KNeighborsRegressor())
+    with pytest.raises(ConfigError, match=r"Sklearn\(estimator\)"):
+        stages([OpenCorridor()], bare)
