@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from bcrl.compose import Plan
+from bcrl.envs import is_simulated
 
 #: Seconds of one core that a seed takes with the paper's budget, on a 2 GHz Xeon whose
 #: other core does the same.
 SECONDS = {
     "car_on_hill": {"FQI": 24.5, "C-FQI": 19.9, "B-FQI": 32.8, "BC-FQI": 22.3},
     "maze": {"FQI": 1.6, "C-FQI": 2.9, "B-FQI": 1.6, "BC-FQI": 3.3},
+    "mountain_car": {"FQI": 30.7, "C-FQI": 38.8, "B-FQI": 36.7, "BC-FQI": 58.3},
     "linear_system": {
         "DQN": 5.3,
         "C-DQN": 6.3,
@@ -20,15 +22,23 @@ SECONDS = {
     },
 }
 #: Iterations or steps, over all stages, that these are for.
-LENGTH = {"car_on_hill": 60, "maze": 280, "linear_system": 40_000}
+LENGTH = {
+    "car_on_hill": 60,
+    "maze": 280,
+    "mountain_car": 125,
+    "linear_system": 40_000,
+}
 #: Seconds an iteration or step of anything else, by family.
 OTHERWISE = {"FQI": 0.1, "DQN": 1e-4}
+#: What a Gymnasium environment adds to each, by its own Python and by evaluations.
+SIMULATED = {"FQI": 0.2, "DQN": 4e-4}
 
 
 def expected(plan: Plan) -> float:
     """Seconds of one core that a seed of `plan` is expected to take."""
     known = SECONDS.get(plan.env, {})
     rate = OTHERWISE[plan.family]
+    rate += SIMULATED[plan.family] if is_simulated(plan.target) else 0.0
     if plan.variant in known:
         rate = known[plan.variant] / LENGTH[plan.env]
     return rate * plan.length

@@ -119,6 +119,8 @@ def refusals() -> Iterator[None]:
     except Exception as error:
         if before == "1":
             raise
+        if isinstance(error.__cause__, BcrlError):  # as in what Hydra instantiates
+            raise error.__cause__ from None
         words = " ".join(str(error).split()) or "no further words"
         why = f"{type(error).__name__}: {words}; {FULL_ERROR}=1 shows where"
         raise BcrlError(why) from error
