@@ -23,7 +23,9 @@ def shown(name: str, tmp_path: Path) -> pd.DataFrame:
     assert done.returncode == 0, done.stderr
     assert not list(tmp_path.iterdir())  # a script leaves no files
     lines = done.stdout.splitlines()
-    return pd.DataFrame([line.split() for line in lines[2:]]).set_index(0)
+    cells = [line.split() for line in lines[2:]]
+    width = max(map(len, cells))
+    return pd.DataFrame([row + [""] * (width - len(row)) for row in cells]).set_index(0)
 
 
 def test_all_examples_are_tested():
@@ -41,5 +43,5 @@ def test_boosting_through_the_curriculum_beats_learning_from_scratch(name, tmp_p
 
 def test_any_regressor_of_scikit_learn_fits_residuals(tmp_path):
     table = shown("own_regressor", tmp_path)
-    assert {"RBF", "forest"} <= set(table.index)
-    assert (table.iloc[:, -1].astype(float).abs() <= 1.0).all()
+    returns = table.loc[["RBF", "forest"], 3].astype(float)  # of the first task
+    assert (returns.abs() <= 1.0).all()

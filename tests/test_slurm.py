@@ -147,7 +147,8 @@ def test_a_sweep_whose_jobs_are_disturbed_ends_in_the_same_bytes(slurm, tmp_path
 
 
 def test_slurm_goes_on_without_the_command_until_it_is_told_to_stop(slurm, tmp_path):
-    sweep = Launched(slurm, tmp_path, "env=maze", "variant=BC", *SMALL)
+    long = (*SMALL[:-1], "algorithm.regressor.trees=2000")  # until it is cancelled
+    sweep = Launched(slurm, tmp_path, "env=maze", "variant=BC", *long)
     sweep.process.terminate()
     code, said = sweep.end()
     assert code == 75 and f"scancel {sweep.array}" in said, said
