@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from bcrl import trust
 from bcrl.envs import _protocol
 from bcrl.envs.base import Env, FiniteEnv, is_finite, is_simulated, lanes_of
-from bcrl.errors import BcrlError, did_you_mean
+from bcrl.errors import BcrlError, ConfigError, did_you_mean
 
 __all__ = [
     "Env",
@@ -34,8 +34,16 @@ def check_tasks(name: str, tasks: Sequence[Env]) -> None:
 
     Pure environments of this package are tested, the user's own are tried.
     """
-    if is_simulated(tasks[-1]):
-        tasks[-1].check_tasks(tasks)
+    target = tasks[-1]
+    for number, task in enumerate(tasks, start=1):
+        for what in ("state_dim", "n_actions"):
+            here, there = getattr(task, what, None), getattr(target, what, None)
+            if here != there:
+                why = f"task {number} has {what} {here}, the target {there}; "
+                why += "in Gymnasium's, a function env.observation makes them equal"
+                raise ConfigError("env.tasks", what, why)
+    if is_simulated(target):
+        target.check_tasks(tasks)
     elif name not in env_names():
         for task in tasks:
             _protocol.check(name, task)

@@ -111,7 +111,7 @@ class SimulatedEnv(Env, Protocol):
         """Simulators to be stepped side by side."""
 
     def check_tasks(self, tasks: Sequence[Env]) -> None:
-        """Raise ConfigError for tasks that can't follow each other."""
+        """Raise ConfigError for tasks that are alike, or don't repeat themselves."""
 
 
 @storable
