@@ -9,15 +9,14 @@ The same objects as behind the `bcrl` command, without configs and files:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import pandas as pd
 from tqdm import tqdm
 
 from bcrl import probes
-from bcrl.composition import placed
+from bcrl.composition import Composition, order_of
 from bcrl.envs import Env, check_tasks, is_simulated
 from bcrl.envs.car_on_hill import CarOnHill
 from bcrl.envs.gymnasium import Gymnasium
@@ -27,9 +26,11 @@ from bcrl.errors import BcrlError, ConfigError
 from bcrl.evaluation import StepProbe
 from bcrl.learners.dqn import DQN
 from bcrl.learners.fqi import FQI
+from bcrl.learners.lspi import LSPI
 from bcrl.q.regressors import ForestRegressor as Forest
 from bcrl.q.regressors import Tabular
 from bcrl.q.scikit import Sklearn
+from bcrl.rules import course
 from bcrl.stage import Course, Learner, Snapshot, Stage, Team, snapshots
 from bcrl.transfer import (
     Boost,
@@ -37,7 +38,6 @@ from bcrl.transfer import (
     ResidualPolicy,
     Shape,
     Transfer,
-    hands_on_a_policy,
     warm_start,
 )
 from bcrl.workers import cores
@@ -45,6 +45,7 @@ from bcrl.workers import cores
 __all__ = [
     "DQN",
     "FQI",
+    "LSPI",
     "Boost",
     "CarOnHill",
     "Forest",
@@ -67,60 +68,54 @@ def stages(
     tasks: Sequence[Env],
     learner: Learner | Sequence[Learner],
     *transfers: Transfer,
+    curriculum: str | Callable[[int], Sequence[int]] | None = None,
 ) -> tuple[Stage, ...]:
-    """One stage a task, in order, the target last; a learner for all, or one a task.
+    """The stages of a course, the same as the command line's; a learner for all slots,
+    or one per slot.
 
-    Without `transfers` the approximator goes on (`warm_start`): [target] · n is the
-    plain algorithm, an easier task first makes it C-. `Boost()` makes it B- or BC-,
-    `Shape()` SC-, both SBC-. Raises ConfigError for what makes no sense together.
+    The slots are the `tasks` as listed, the target last. With `curriculum` (as in the
+    group: "on", "off" or a function of the number of tasks) they are the tasks that it
+    visits, `tasks` then being listed once each. Without `transfers` the approximator
+    is passed on (`warm_start`): [target] · n is the plain algorithm, an easier task
+    first makes it C-. `Boost()` makes it B- or BC-, `Shape()` SC-, both SBC-. Raises
+    ConfigError for what makes no sense together.
     """
-    transfers = transfers or (warm_start,)
-    learners = [learner] * len(tasks) if hasattr(learner, "learn") else learner
-    _check(tasks, learners, transfers)
-    different = list(dict.fromkeys(tasks))
-    made = []
-    for number, (task, own) in enumerate(zip(tasks, learners, strict=True), start=1):
-        if isinstance(own, DQN) and number > 1 and hands_on_a_policy(transfers):
-            own = replace(own, random_steps=0)
-        made.append(Stage(number, different.index(task) + 1, task, own, transfers, 0))
-    return placed(made)
+    tasks = list(tasks)
+    if not tasks:
+        raise ConfigError("tasks", "0 tasks", "at least one is needed, the target last")
+    boosts = [t for t in transfers if isinstance(t, Boost)]
+    others = [t for t in transfers if not isinstance(t, Boost) and t is not warm_start]
+    _check(tasks, transfers, max(len(boosts), len(others)))
+    if curriculum is None:
+        different = [task for task in dict.fromkeys(tasks) if task != tasks[-1]]
+        different.append(tasks[-1])
+        order = tuple(different.index(task) for task in tasks)
+    else:
+        different, order = tasks, order_of(curriculum, tasks)
+    check_tasks(tasks[-1].name, different)
+    chosen = Composition(tuple(different), order, *(boosts or [None]), *others)
+    each = [learner] * len(order) if hasattr(learner, "learn") else list(learner)
+    try:
+        return course(chosen, each)
+    except ConfigError as error:  # a config's keys, where there is no config
+        key = error.key.removeprefix("algorithm.")
+        raise ConfigError(key, error.value, error.allowed) from error
 
 
-def _check(
-    tasks: Sequence[Env], learners: Sequence[Learner], transfers: Sequence[Transfer]
-) -> None:
-    """Raise ConfigError for what `stages` can't make a course of."""
-
-    def wrong(what: object, why: str) -> ConfigError:
-        return ConfigError("stages", what, why)
-
-    if not tasks or len(learners) != len(tasks):
-        raise wrong(f"{len(tasks)} tasks", f"there are {len(learners)} learners")
-    target, fitted = tasks[-1], isinstance(learners[-1], FQI)
-    for own in learners:
-        if not hasattr(own, "learn") or isinstance(own, FQI) != fitted:
-            raise wrong(own, "a course has learners of one family, FQI or DQN")
-        regressor = getattr(own, "regressor", None)
-        if fitted and (isinstance(regressor, type) or not hasattr(regressor, "fit")):
-            raise wrong(regressor, "is no regressor")
-        if fitted and not hasattr(regressor, "finite_only"):
-            why = "is no regressor of bcrl's; Sklearn(estimator) makes one of it"
-            raise wrong(regressor, why)
+def _check(tasks: Sequence[Env], transfers: Sequence[Transfer], most: int) -> None:
+    """Raise ConfigError for arguments that no config could say."""
     for transfer in transfers:
-        steers = isinstance(transfer, (PolicyReuse, ResidualPolicy))
         if isinstance(transfer, type):
-            raise wrong(transfer.__name__, f"is a class, write {transfer.__name__}()")
-        if steers and fitted:
-            raise wrong(transfer, "steers step by step, FQI learns from whole episodes")
-        combines = isinstance(transfer, ResidualPolicy)
-        if combines and getattr(target, "actions", None) is None:
-            raise wrong(
-                transfer, f"combines actions as vectors, {target.name} has none"
-            )
-    others = [task for task in dict.fromkeys(tasks) if task != target]
-    if {is_simulated(task) for task in tasks} != {is_simulated(target)}:
-        raise wrong(target, "simulators and pure environments don't mix")
-    check_tasks(target.name, [*others, target])
+            why = f"is a class, write {transfer.__name__}()"
+            raise ConfigError("transfers", transfer.__name__, why)
+        if not callable(transfer):
+            raise ConfigError("transfers", transfer, "is no transfer, such as Boost()")
+    if most > 1 or (warm_start in transfers and len(transfers) > 1):
+        why = "must be one Boost() and one other at most, or warm_start alone"
+        raise ConfigError("transfers", list(transfers), why)
+    if len({is_simulated(task) for task in tasks}) > 1:
+        why = "simulators and pure environments don't mix"
+        raise ConfigError("tasks", tasks[-1], why)
 
 
 def run(

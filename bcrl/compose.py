@@ -88,6 +88,7 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
     chosen_algorithm = algorithm(name)
     chosen = composition(config, tasks)
     stages = chosen_algorithm.stages(section, chosen)
+    chosen.check()  # an algorithm of the user's may have left it out
     differing = {tag: differences(config, other) for tag, other in known.items()}
     same = [tag for tag, changed in differing.items() if not changed]
     tag = same[0] if same else _short_hash(differing[None])

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
 
 from bcrl import trust
 from bcrl.config import Choice, construct, one_of
@@ -11,14 +13,15 @@ from bcrl.curriculum import CURRICULA
 from bcrl.envs import Env
 from bcrl.errors import ConfigError
 from bcrl.identity import Plain
-from bcrl.stage import Stage
+from bcrl.q import ZERO
 from bcrl.transfer import (
     TRANSFERS,
     Boost,
-    PolicyReuse,
     ResidualPolicy,
     Shape,
+    Start,
     Transfer,
+    tried,
     warm_start,
 )
 
@@ -29,64 +32,150 @@ class Composition:
 
     tasks: tuple[Env, ...]  # easiest first, the target last
     order: tuple[int, ...]  # the task of each slot
-    boost: Boost | None
-    transfer: Transfer | None
-    scale: Plain
+    boost: Boost | None = None
+    transfer: Transfer | None = None
+    scale: Plain = field(default_factory=dict)
+    written: Mapping[str, object] = field(default_factory=dict)  # key → as it was named
 
     @property
     def transfers(self) -> tuple[Transfer, ...]:
         """What happens between two stages: a warm start unless something else does."""
-        chosen = (self.boost, self.transfer)
-        return tuple(t for t in chosen if t is not None) or (warm_start,)
+        return self._chosen or (warm_start,)
+
+    @property
+    def _chosen(self) -> tuple[Transfer, ...]:
+        return tuple(t for t in (self.boost, self.transfer) if t is not None)
+
+    @property
+    def slots(self) -> tuple[Env, ...]:
+        """The environment of each slot."""
+        return tuple(self.tasks[task] for task in self.order)
 
     @property
     def target_only(self) -> bool:
-        """Whether every slot has the same task."""
-        return len(set(self.order)) == 1
+        """Whether every slot has the target, or a task that is equal to it."""
+        return all(env == self.tasks[-1] for env in self.slots)
+
+    @cached_property
+    def start(self) -> Start | None:
+        """What a later stage starts from, as far as transfers tell without training."""
+        return tried(self.transfers)
+
+    def refusal(self, key: str, value: object, why: str) -> ConfigError:
+        """A ConfigError that names `value` as the caller did."""
+        return ConfigError(key, self.written.get(key, value), why)
+
+    def check(self) -> None:
+        """Raise ConfigError for choices that make no sense together."""
+        boost, transfer, start = self.boost, self.transfer, self.start
+        if len(self.order) == 1 and self._chosen:
+            key = "boosting" if boost else "transfer"
+            raise self.refusal(key, boost or transfer, _one_task(self.tasks[-1]))
+        if start is None:
+            return
+        if start.steering and self.target_only:
+            why = "needs an earlier task whose policy helps: curriculum=on"
+            raise self.refusal("transfer", transfer, why)
+        if isinstance(start.steering, ResidualPolicy):
+            if getattr(self.tasks[-1], "actions", None) is None:
+                why = (
+                    "combines actions as vectors, which env.action_vectors has to name"
+                )
+                raise self.refusal("transfer", transfer, why)
+            if start.base is not ZERO:
+                why = "its Q is about its own actions, not the executed ones that a "
+                raise self.refusal(
+                    "transfer", transfer, why + "base is about: boosting=off"
+                )
+        for key, one, other in (
+            ("transfer", transfer, boost),
+            ("boosting", boost, transfer),
+        ):
+            rest = () if other is None else (other,)
+            if one is not None and tried(rest) == start:
+                why = "has no effect: the next stage starts as it does without"
+                raise self.refusal(key, one, why)
 
 
 def composition(config: Plain, tasks: list[Env]) -> Composition:
-    """The groups' choices, as far as they make sense together."""
-    name = config["curriculum"]["name"]
-    curriculum, ordered = name != "off", _curriculum(name)
+    """The groups' choices; `check` says whether they make sense together."""
     boost, transfer = boost_of(config["boosting"]), transfer_of(config["transfer"])
-    if len(tasks) == 1 and (curriculum or boost or transfer):
-        key = "curriculum" if curriculum else "boosting" if boost else "transfer"
-        why = f"{config['env']['name']} has one task, so there is no stage to hand over"
-        raise ConfigError(
-            key,
-            config[key]["name"],
-            f"{why}; env.tasks needs at least two values",
+    return Composition(
+        tuple(tasks),
+        order_of(config["curriculum"]["name"], tasks),
+        boost,
+        transfer,
+        config["scale"],
+        {
+            "boosting": _option(config["boosting"]["name"], boost),
+            "transfer": _option(config["transfer"]["name"], transfer),
+        },
+    )
+
+
+def order_of(curriculum: object, tasks: Sequence[Env]) -> tuple[int, ...]:
+    """The task of each slot: as many slots as tasks, the target among them.
+
+    `curriculum` is one of CURRICULA, a trusted `module.function` or a function from the
+    number of tasks to their order. Raises ConfigError for an order that is none.
+    """
+    n = len(tasks)
+
+    def wrong(why: str) -> ConfigError:
+        return ConfigError("curriculum", curriculum, why)
+
+    if n == 1 and curriculum != "off":
+        raise wrong(_one_task(tasks[-1]))
+    ordered = curriculum if callable(curriculum) else _curriculum(curriculum)
+    try:
+        found, again = ordered(n), ordered(n)
+    except Exception as error:  # whatever a function of the user's does
+        raise wrong(f"failed for {n} tasks: {type(error).__name__}: {error}") from error
+    try:
+        fits = isinstance(found, (list, tuple, range)) and not any(
+            isinstance(task, bool) for task in found
         )
-    if isinstance(transfer, (PolicyReuse, ResidualPolicy)) and not curriculum:
-        why = "needs an earlier task whose policy helps: curriculum=on"
-        raise ConfigError("transfer", config["transfer"]["name"], why)
-    vectors = getattr(tasks[-1], "actions", None)
-    if isinstance(transfer, ResidualPolicy) and vectors is None:
-        why = "combines actions as vectors, which env.action_vectors has to name"
-        raise ConfigError("transfer", "residual_policy", why)
-    if isinstance(transfer, ResidualPolicy) and boost:
-        why = (
-            "its Q is about its own actions, not the executed ones that a base is "
-            "about: boosting=off"
-        )
-        raise ConfigError("transfer", "residual_policy", why)
-    order = ordered(len(tasks))
-    if not set(order) <= set(range(len(tasks))):
-        why = f"visits {order}, but the tasks are 0 to {len(tasks) - 1}"
-        raise ConfigError("curriculum", name, why)
-    if len(order) != len(tasks):
+        order = tuple(operator.index(task) for task in found) if fits else ()
+    except TypeError:
+        order = ()
+    if not order or not set(order) <= set(range(n)):
+        why = f"visits {found!r:.80}, but must return a list of {n} integers"
+        raise wrong(f"{why}, tasks from 0 to {n - 1}")
+    if len(order) != n:
         why = f"has {len(order)} slots, budgets are lists with one entry a task"
-        raise ConfigError("curriculum", name, f"{why} ({len(tasks)})")
-    return Composition(tuple(tasks), tuple(order), boost, transfer, config["scale"])
+        raise wrong(f"{why} ({n})")
+    if list(again) != list(found):
+        raise wrong(
+            f"visits {found}, then {again}: it must depend on its argument only"
+        )
+    if n - 1 not in order:
+        why = f"visits {found}, never the target, which is task {n - 1}"
+        raise wrong(f"{why}: a run is measured in the target, so let a slot have it")
+    return order
+
+
+def _one_task(env: Env) -> str:
+    why = f"{env.name} has one task, so there is no stage to hand over"
+    return f"{why}; env.tasks needs at least two values"
 
 
 def _curriculum(name: object) -> Callable[[int], list[int]]:
     """The order called `name`, or a trusted function `module.name` of the user's."""
     if isinstance(name, str) and "." in name:
-        return trust.attribute("curriculum.name", name, name)
+        found = trust.attribute("curriculum.name", name, name)
+        if not callable(found):
+            raise ConfigError("curriculum.name", name, "must be a function")
+        return found
     one_of("curriculum.name", name, list(CURRICULA))
     return CURRICULA[name]
+
+
+def _option(name: str, chosen: object) -> str:
+    """The option of conf/ that a choice is: the released readings turn every switch."""
+    switches = fields(chosen) if isinstance(chosen, (Boost, Shape)) else ()
+    if switches and all(getattr(chosen, s.name) != s.default for s in switches):
+        return "released" if isinstance(chosen, Boost) else f"{name}_released"
+    return name
 
 
 def boost_of(section: Plain) -> Boost | None:
@@ -121,17 +210,3 @@ def _named(group: str, section: object, names: list[str]) -> Plain:
         raise ConfigError(group, section, "must be a section with a name")
     one_of(f"{group}.name", section.get("name"), names)
     return {key: value for key, value in section.items() if key != "name"}
-
-
-def capped(value: int, cap: int | None) -> int:
-    """A budget under the scale's cap."""
-    return value if cap is None else min(value, cap)
-
-
-def placed(stages: Sequence[Stage]) -> tuple[Stage, ...]:
-    """Stages whose `before` counts what the ones before them take."""
-    done, out = 0, []
-    for stage in stages:
-        out.append(replace(stage, before=done))
-        done += stage.learner.length
-    return tuple(out)

@@ -17,10 +17,10 @@ class ConfigError(BcrlError):
 
     def __init__(self, key: str, value: object, allowed: str) -> None:
         super().__init__(f"{key}={value}: {allowed}")
-        self._arguments = (key, value, allowed)
+        self.key, self.value, self.allowed = key, value, allowed
 
-    def __reduce__(self) -> tuple:
-        return type(self), self._arguments  # so that it can leave a worker process
+    def __reduce__(self) -> tuple:  # so that it can leave a worker process
+        return type(self), (self.key, self.value, self.allowed)
 
 
 def at_least(key: str, value: int | None, least: int) -> None:

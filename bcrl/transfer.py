@@ -129,18 +129,34 @@ def warm_start(start: Start, previous: Learned) -> Start:
     return replace(start, initial=previous.residual)
 
 
-def hands_on_a_policy(transfers: Sequence[Transfer]) -> bool:
-    """Whether the next stage has a policy from the start: shaping alone gives none."""
-    return any(not isinstance(transfer, Shape) for transfer in transfers)
-
-
 def begin(transfers: Sequence[Transfer], previous: Learned | None) -> Start:
-    """The start of a stage; without a previous stage there is nothing to transfer."""
+    """The start of a stage; without a previous stage there is nothing to transfer.
+
+    Raises ConfigError for a transfer that returns something else than a `Start`.
+    """
     start = Start(previous)
     if previous is not None:
         for transfer in transfers:
             start = transfer(start, previous)
+            if not isinstance(start, Start):
+                why = f"must return a Start (bcrl.transfer), returned {start!r:.80}"
+                raise ConfigError("transfer", transfer, why)
     return start
+
+
+def _any(states: Any, n_actions: int) -> Any:
+    """A Q-function to try transfers on: 0 everywhere, but not `ZERO`."""
+    return ZERO(states, n_actions)
+
+
+def tried(transfers: Sequence[Transfer]) -> Start | None:
+    """What transfers make of a start; None if they need a Q that was learned."""
+    try:
+        return begin(transfers, Learned(_any, _any))
+    except ConfigError:
+        raise
+    except Exception:  # a transfer of the user's that reads, say, a network's weights
+        return None
 
 
 #: name in the YAML of group `transfer` → its class; constructor arguments are its keys

@@ -5,20 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from bcrl.composition import Composition, capped, placed
+from bcrl.composition import Composition
 from bcrl.config import construct, one_of, per_task
-from bcrl.envs import Env
 from bcrl.errors import ConfigError, at_least
 from bcrl.identity import Plain
 from bcrl.learners.dqn import DQN
 from bcrl.learners.lspi import LSPI
 from bcrl.q.quadratic import FEATURES
-from bcrl.stage import Stage
-from bcrl.transfer import hands_on_a_policy, warm_start
+from bcrl.rules import BOUNDS, capped, check_lspi, course
+from bcrl.stage import Learner, Stage
+from bcrl.transfer import warm_start
 
 FAMILY = "DQN"
 LOCKSTEP = 20
 LEARNERS = ("auto", "dqn", "lspi")
+#: Settings that may differ between the slots, besides `learners`.
+PER_TASK = (
+    *("steps", "epsilon", "epsilon_start", "anneal_steps", "target_update"),
+    *("evaluate_every", "evaluation_episodes", "evaluation_epsilon"),
+)
 
 
 @dataclass(frozen=True)
@@ -55,42 +60,34 @@ class Settings:
 
 
 def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
-    """One stage a task slot; one in all where nothing would change between slots."""
+    """The course that DQN makes of the slots, LSPI in the first where it can."""
     settings: Settings = construct("algorithm", Settings, section)
-    _check(settings)
-    warm = chosen.transfers == (warm_start,)
-    slots = list(enumerate(chosen.order))
-    alone = warm and chosen.target_only
-    if alone:  # the networks, the task and the replay go on: no stage ends
-        slots = slots[-1:]
-    values = _per_task(settings, len(chosen.tasks))
-    made = []
-    for number, (slot, task) in enumerate(slots, start=1):
-        env = chosen.tasks[task]
+    lspi = _lspi_settings(settings)
+    values = _per_task(settings, len(chosen.order))
+    learners: list[Learner] = []
+    for slot, env in enumerate(chosen.slots):
         own = {key: each[slot] for key, each in values.items()}
         kind = own.pop("learners")
         if kind == "auto":
             quadratic = getattr(env, "linear_quadratic", None) is not None
-            kind = "lspi" if quadratic and not warm else "dqn"
+            first = slot == 0 and chosen.transfers != (warm_start,)
+            kind = "lspi" if quadratic and first else "dqn"
         if kind == "lspi":
-            learner = _lspi(settings, env, own, warm)
+            check_lspi(chosen, slot, "lspi")
+            learners.append(_lspi(lspi, env.horizon, own))
         else:
-            if alone:
-                own["steps"] = sum(values["steps"])
-            own["steps"] = capped(own["steps"], chosen.scale["max_steps"])
-            # Whoever starts without a policy fills the replay at random.
-            knows = number > 1 and hands_on_a_policy(chosen.transfers)
-            learner = DQN(
-                **own,
-                random_steps=0 if knows else settings.random_steps,
-                learning_starts=settings.learning_starts,
-                batch_size=settings.batch_size,
-                replay_size=settings.replay_size,
-                hidden=tuple(settings.hidden),
-                learning_rate=float(settings.learning_rate),
+            learners.append(
+                DQN(
+                    **own,
+                    random_steps=settings.random_steps,
+                    learning_starts=settings.learning_starts,
+                    batch_size=settings.batch_size,
+                    replay_size=settings.replay_size,
+                    hidden=tuple(settings.hidden),
+                    learning_rate=float(settings.learning_rate),
+                )
             )
-        made.append(Stage(number, task + 1, env, learner, chosen.transfers, 0))
-    return placed(made)
+    return capped(course(chosen, learners), DQN, steps=chosen.scale["max_steps"])
 
 
 def _per_task(settings: Settings, n: int) -> dict[str, list]:
@@ -102,63 +99,18 @@ def _per_task(settings: Settings, n: int) -> dict[str, list]:
         raise ConfigError("algorithm.learners", learners, why)
     for name in learners:
         one_of("algorithm.learners", name, LEARNERS)
-    bounds = {
-        "steps": (int, 1),
-        "epsilon": (float, 0, 1),
-        "epsilon_start": (float, 0, 1),
-        "anneal_steps": (int, 0),
-        "target_update": (int, 1),
-        "evaluate_every": (int, 1),
-        "evaluation_episodes": (int, 1),
-        "evaluation_epsilon": (float, 0, 1),
-    }
     return {"learners": learners} | {
-        key: per_task(f"algorithm.{key}", getattr(settings, key), n, *bound)
-        for key, bound in bounds.items()
+        key: per_task(f"algorithm.{key}", getattr(settings, key), n, *BOUNDS[key])
+        for key in PER_TASK
     }
 
 
-def _check(settings: Settings) -> None:
-    """Raise ConfigError for a value out of range, by itself or beside another."""
-    at_least("algorithm.random_steps", settings.random_steps, 0)
-    at_least("algorithm.learning_starts", settings.learning_starts, 0)
-    at_least("algorithm.batch_size", settings.batch_size, 1)
-    if settings.replay_size < settings.batch_size:
-        why = f"holds less than a batch, algorithm.batch_size={settings.batch_size}"
-        raise ConfigError("algorithm.replay_size", settings.replay_size, why)
-    if settings.replay_size <= settings.learning_starts:
-        why = (
-            "never holds more than algorithm.learning_starts="
-            f"{settings.learning_starts}, so nothing would be learned"
-        )
-        raise ConfigError("algorithm.replay_size", settings.replay_size, why)
-    if settings.learning_rate <= 0:
-        raise ConfigError(
-            "algorithm.learning_rate", settings.learning_rate, "must be above 0"
-        )
-    _lspi_settings(settings)
-    widths = settings.hidden
-    if not widths or not all(type(w) is int and w >= 1 for w in widths):
-        why = "must be a list of layer widths, each at least 1"
-        raise ConfigError("algorithm.hidden", widths, why)
-
-
-def _lspi(settings: Settings, env: Env, own: dict[str, Any], warm: bool) -> LSPI:
-    """LSPI for a task that suits it; ConfigError says why not."""
-    if getattr(env, "linear_quadratic", None) is None or not hasattr(env, "push"):
-        why = (
-            f"learns quadratic Q-functions of continuous actions, but {env} is no "
-            "linear-quadratic task"
-        )
-        raise ConfigError("algorithm.learners", "lspi", why)
-    if warm:
-        why = "leaves no network to start DQN's from: boosting=on or a transfer needed"
-        raise ConfigError("algorithm.learners", "lspi", why)
-    chosen, steps = _lspi_settings(settings), own["steps"]
-    episodes, rest = divmod(steps, chosen.iterations * env.horizon)
+def _lspi(chosen: LSPISettings, horizon: int, own: dict[str, Any]) -> LSPI:
+    """LSPI with a slot's steps, which must be a multiple of its iterations'."""
+    episodes, rest = divmod(own["steps"], chosen.iterations * horizon)
     if rest or not episodes:
-        why = f"LSPI needs a multiple of {chosen.iterations} iterations x {env.horizon}"
-        raise ConfigError("algorithm.steps", steps, f"{why} steps")
+        why = f"LSPI needs a multiple of {chosen.iterations} iterations x {horizon}"
+        raise ConfigError("algorithm.steps", own["steps"], f"{why} steps")
     return LSPI(
         chosen.iterations,
         episodes,
@@ -166,7 +118,7 @@ def _lspi(settings: Settings, env: Env, own: dict[str, Any], warm: bool) -> LSPI
         chosen.features,
         chosen.drop_last,
         own["evaluation_episodes"],
-        env.horizon,
+        horizon,
     )
 
 
@@ -176,6 +128,6 @@ def _lspi_settings(settings: Settings) -> LSPISettings:
     at_least("algorithm.lspi.iterations", chosen.iterations, 1)
     one_of("algorithm.lspi.features", chosen.features, FEATURES)
     if chosen.noise_std <= 0:
-        why = "must be above 0: without noise LSTDQ sees one action a state"
+        why = "must be above 0: without noise LSTDQ sees one action per state"
         raise ConfigError("algorithm.lspi.noise_std", chosen.noise_std, why)
     return chosen
