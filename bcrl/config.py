@@ -73,7 +73,8 @@ def construct(section: str, cls: type, values: Mapping[str, Any]) -> Any:
 
     Raises ConfigError naming `section.key` otherwise.
     """
-    hints = {f.name: get_type_hints(cls)[f.name] for f in dataclasses.fields(cls)}
+    kinds = get_type_hints(cls)
+    hints = {f.name: kinds[f.name] for f in dataclasses.fields(cls)}
     for key, value in values.items():
         if key not in hints:
             raise ConfigError(

@@ -14,7 +14,6 @@ from bcrl.errors import ConfigError
 from bcrl.learners.lspi import LSPI
 from bcrl.q import ZERO, Sum
 from bcrl.q.regressors import REGRESSORS
-from bcrl.tasks import tasks_of
 from bcrl.transfer import (
     TRANSFERS,
     Boost,
@@ -27,7 +26,7 @@ from bcrl.transfer import (
     warm_start,
 )
 from tests.conftest import plans
-from tests.toys import Corridor, OpenCorridor
+from tests.toys import OpenCorridor
 
 
 def options(group: str) -> dict[str, dict]:
@@ -69,7 +68,7 @@ def by_command(config: dict):
 
 def by_api(config: dict):
     """The same, as a script would write it."""
-    tasks = tasks_of(config["env"])
+    tasks, _ = compose._tasks(config["env"])
     transfers = []
     for group, classes in (("boosting", {"on": Boost}), ("transfer", TRANSFERS)):
         values = dict(config[group])
@@ -131,9 +130,13 @@ def dqn(section, curriculum, tasks, transfers):
 
 @pytest.mark.parametrize("algorithm", options("algorithm"))
 @pytest.mark.parametrize("env", options("env"))
-def test_all_combinations_of_groups_give_the_same_course_or_refusal(env, algorithm):
+def test_all_combinations_of_groups_give_the_same_course_or_refusal(
+    env, algorithm, monkeypatch
+):
     config, seen = settled(env, algorithm), set()
-    n = len(tasks_of(config["env"]))
+    made = compose._tasks(config["env"])  # once: the groups don't change them
+    monkeypatch.setattr(compose, "_tasks", lambda section: made)
+    n = len(made[0])
     for own, *chosen in itertools.product(
         OWN[algorithm], *(each.values() for each in CHOICES)
     ):
@@ -187,9 +190,7 @@ def test_a_curriculum_that_is_none_is_refused_in_both(order, monkeypatch):
 def test_a_curriculum_has_no_moods():
     moods = iter([[0, 1], [1, 1]])
     with pytest.raises(ConfigError, match="curriculum"):
-        api.stages(
-            [Corridor(2.0), Corridor()], FITTED, curriculum=lambda n: next(moods)
-        )
+        api.stages(TASKS[1:], FITTED, curriculum=lambda n: next(moods))
 
 
 # --- what a script can say and a config can't ---
