@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import functools
+from collections import ChainMap
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.envs import Env, is_finite, is_simulated, lanes_of
+from bcrl.envs import Env, Success, is_finite, is_simulated, lanes_of
 from bcrl.policies import greedy, uniform
 from bcrl.q import Q, Table
 
+AT_ONCE = 128  # simulators that exist at a time in `play`
 CHOICES = 3  # uniforms a step-wise decision takes: explore? which action? the prior's
 
 
@@ -27,25 +29,31 @@ class Episodes:
     absorbing: NDArray[np.bool_]  # (S, E, T)
     length: NDArray[np.intp]  # (S, E)
     start: NDArray[np.float64]  # (S, E, …) what `env.initial` gave
+    reported: NDArray[np.bool_] | None = None  # (S, E) success, as a simulator says
 
     def discounted_return(self, gamma: float) -> NDArray[np.float64]:
         """Σ_t γ^t r_t of each episode, shape (S, E)."""
         steps = np.arange(self.reward.shape[-1])
         return (self.reward * gamma**steps).sum(-1)
 
-    def solved(self, success: str = "unpunished") -> NDArray[np.bool_]:
-        """Whether each episode was a success, shape (S, E).
-
-        That is to be absorbed, `unpunished` or however (`absorbed`), or to have lasted
-        to the horizon (`survived`).
-        """
+    def solved(self, success: Success | str = "unpunished") -> NDArray[np.bool_]:
+        """Whether each episode was a success by a rule of `env.success`, (S, E)."""
+        rule, threshold = Success(success) if isinstance(success, str) else success
         last = np.maximum(self.length - 1, 0)[..., None]
         ended = np.take_along_axis(self.absorbing, last, -1)[..., 0]
-        if success == "survived":
-            return ~ended & (self.length == self.reward.shape[-1])
-        if success == "absorbed":
-            return ended
-        return ended & (np.take_along_axis(self.reward, last, -1)[..., 0] >= 0.0)
+        reward = np.take_along_axis(self.reward, last, -1)[..., 0]
+        match rule:
+            case "absorbed":
+                return ended
+            case "survived":
+                return ~ended
+            case "rewarded":
+                return ended & (reward > 0.0)
+            case "threshold":
+                return self.reward.sum(-1) >= threshold
+            case "info":
+                return self.reported
+        return ended & (reward >= 0.0)
 
 
 def draws(rng: np.random.Generator, env: Env, episodes: int) -> NDArray[np.float64]:
@@ -71,9 +79,10 @@ def evaluation_starts(rng: np.random.Generator, env: Env) -> NDArray[np.float64]
     return env.evaluation_states()
 
 
-def success_of(env: Env) -> str:
+def success_of(env: Env) -> Success:
     """What `Episodes.solved` takes for a success in `env`."""
-    return getattr(env, "success", "unpunished")
+    threshold = getattr(env, "success_threshold", None)
+    return Success(getattr(env, "success", "unpunished"), threshold or 0.0)
 
 
 #: Actions (S, E) at states (S, E, d), from uniforms (S, E, 2 or more); only the lanes
@@ -109,6 +118,9 @@ def play(
 ) -> Episodes:
     """Episodes from start (S, E, d); the last of u (S, T, E, …) are the env's noise."""
     n_seeds, n_episodes, _ = start.shape
+    part = max(1, AT_ONCE // n_seeds)
+    if is_simulated(env) and n_episodes > part:
+        return _in_parts(env, policy, start, u, part)
     horizon, noise = u.shape[1], u.shape[-1] - env.step_noise
     lanes_of_a_step = (horizon, n_seeds, n_episodes)  # what is written at once is close
     running = lanes_of(env)
@@ -141,7 +153,39 @@ def play(
     parts = (state, action, reward, absorbing)
     # Copied, for sums over strides would depend on how many lanes there are.
     by_lane = [np.ascontiguousarray(np.moveaxis(part, 0, 2)) for part in parts]
-    return Episodes(*by_lane, length, start)
+    reported = getattr(running, "succeeded", None)
+    running.close()
+    return Episodes(*by_lane, length, start, reported)
+
+
+def _in_parts(
+    env: Env, policy: Policy, start: NDArray, u: NDArray, size: int
+) -> Episodes:
+    """`play`, with so many episodes of each seed at a time.
+
+    The policy sees the arrays of all of them, and so decides as it would for all.
+    """
+    played = []
+    for first in range(0, start.shape[1], size):
+        part = slice(first, first + size)
+
+        def decide(*own: NDArray, part: slice = part) -> NDArray:
+            whole = []
+            for x in own:  # states, uniforms, alive
+                shape = (len(x), start.shape[1], *x.shape[2:])
+                whole.append(np.zeros(shape, x.dtype))
+                whole[-1][:, part] = x
+            return policy(*whole)[:, part]
+
+        played.append(play(env, decide, start[:, part], u[:, :, part]))
+    joined = {}
+    for name in (field.name for field in fields(Episodes)):
+        values = [getattr(each, name) for each in played]
+        if isinstance(values[0], dict):  # by seed
+            joined[name] = dict(ChainMap(*values))
+        elif values[0] is not None:
+            joined[name] = np.concatenate(values, 1)
+    return Episodes(**joined)
 
 
 @functools.lru_cache(maxsize=64)

@@ -6,6 +6,7 @@ import dataclasses
 import importlib
 import importlib.util
 import os
+from collections.abc import Collection
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -13,6 +14,11 @@ from typing import Any
 from bcrl.errors import ConfigError
 
 VARIABLE = "BCRL_TRUST"  # of the process's environment; no config can set it
+
+
+def is_foreign(name: str, ours: Collection[str]) -> bool:
+    """Whether `name` means a module of the user's; names of `ours` never do."""
+    return name not in ours and ("." in name or is_trusted(name))
 
 
 def is_trusted(name: str) -> bool:
@@ -26,11 +32,14 @@ def _listed() -> list[str]:
     return [entry.strip() for entry in entries if entry.strip()]
 
 
-def module(key: str, name: str, where: str) -> ModuleType:
-    """The trusted module `where`, imported; ConfigError if it can't be."""
+def module(key: str, name: str, where: str, known: Collection[str] = ()) -> ModuleType:
+    """The module `where`, imported; ConfigError if it can't be.
+
+    It must be trusted, or of a package that is `known`.
+    """
     if not all(part.isidentifier() for part in where.split(".")):
         raise ConfigError(key, name, "isn't the name of a module")
-    if not is_trusted(where):
+    if where.partition(".")[0] not in known and not is_trusted(where):
         why = "isn't of this package; if you trust its code, set the environment "
         raise ConfigError(key, name, f"{why}variable {VARIABLE}={where.split('.')[0]}")
     try:
@@ -55,10 +64,10 @@ def sources() -> list[Path]:
     return sorted(found)
 
 
-def attribute(key: str, name: str, dotted: str) -> Any:
-    """What the trusted module that `dotted` begins with calls by its last part."""
+def attribute(key: str, name: str, dotted: str, known: Collection[str] = ()) -> Any:
+    """What the module that `dotted` begins with calls by its last part."""
     where, _, last = dotted.rpartition(".")
-    found = getattr(module(key, name, where), last, None)
+    found = getattr(module(key, name, where, known), last, None)
     if found is None:
         raise ConfigError(key, name, f"the module {where} has no {last}")
     return found

@@ -71,7 +71,7 @@ def test_episodes_are_those_of_gymnasium_itself():
     env = gymnasium.make("MountainCar-v0", max_episode_steps=40)
     env.unwrapped.force = 0.004
     for lane, draw in enumerate(starts[:, 0]):
-        seen, _ = env.reset(seed=int(draw * 2**53))
+        seen, _ = env.reset(seed=int(draw * 2**31))
         for t in range(found.length[0, lane]):
             np.testing.assert_array_equal(found.state[0, lane, t], seen)
             seen, reward, *_ = env.step(int(found.action[0, lane, t]))
@@ -166,7 +166,7 @@ def test_a_simulator_has_its_constants_to_itself():
     lanes = task.lanes()
     lanes.begin(np.full((2, 1), 0.5))
     lanes.step(None, np.zeros(2, int), None)
-    assert [lane.unwrapped.sums for lane in lanes.running] == [[1.0], [1.0]]
+    assert [lane.env.unwrapped.sums for lane in lanes.running] == [[1.0], [1.0]]
     assert task.kwargs == {"sums": [0.0]}
 
 
@@ -242,8 +242,7 @@ BAD = {
     "no id": ([], "env.id"),
     "a misspelt id": (["env.id=CartPol-v1"], "did you mean CartPole-v1?"),
     "a foreign module": (["env.id=os:CartPole-v1"], "BCRL_TRUST=os"),
-    "continuous actions": (["env.id=Pendulum-v1"], "only Discrete"),
-    "no Box": (["env.id=FrozenLake-v1"], "only a Box"),
+    "continuous actions": (["env.id=Pendulum-v1"], "{name: DiscretizeAction"),
     "no horizon": (["env.id=tests/Endless-v0"], "env.horizon"),
     "an unknown argument": (["env.kwargs={prise: 2.0}"], "did you mean prize?"),
     "our argument": (["env.kwargs={render_mode: human}"], "is set by bcrl"),
@@ -297,9 +296,8 @@ def test_what_cannot_be_is_refused_before_work(name):
 
 
 def test_values_that_are_not_finite_are_an_error_by_name():
-    task = Gymnasium("tests/Counter-v0", kwargs={"broken": True})
-    with pytest.raises(BcrlError, match=r"tests/Counter-v0: .*not finite"):
-        played(task)
+    with pytest.raises(BcrlError, match=r"tests/Counter-v0: step gave .* nan .*finite"):
+        Gymnasium("tests/Counter-v0", kwargs={"broken": True})
 
 
 def test_a_map_joins_tasks_with_different_observations(tmp_path, monkeypatch):

@@ -17,11 +17,11 @@ def algorithm(name: str) -> ModuleType:
     seeds it likes to train together) and `stages(section, composition)`. Others are
     modules of the user's own, as BCRL_TRUST allows.
     """
-    if isinstance(name, str) and ("." in name or trust.is_trusted(name)):
+    names = [module.name for module in pkgutil.iter_modules(__path__)]
+    if isinstance(name, str) and trust.is_foreign(name, names):
         for needed in ("FAMILY", "LOCKSTEP", "stages"):
             trust.attribute("algorithm.name", name, f"{name}.{needed}")
         return trust.module("algorithm.name", name, name)
-    names = [module.name for module in pkgutil.iter_modules(__path__)]
     if name not in names:
         raise ConfigError("algorithm.name", name, did_you_mean(str(name), names))
     return importlib.import_module(f"{__name__}.{name}")

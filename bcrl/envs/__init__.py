@@ -8,12 +8,14 @@ from collections.abc import Sequence
 
 from bcrl import trust
 from bcrl.envs import _protocol
+from bcrl.envs._success import Success
 from bcrl.envs.base import Env, FiniteEnv, is_finite, is_simulated, lanes_of
 from bcrl.errors import BcrlError, ConfigError, did_you_mean
 
 __all__ = [
     "Env",
     "FiniteEnv",
+    "Success",
     "check_tasks",
     "env_class",
     "env_names",
@@ -54,7 +56,7 @@ def env_class(name: str) -> type:
 
     Others are modules of the user's own, as BCRL_TRUST allows.
     """
-    if "." in name or trust.is_trusted(name):
+    if trust.is_foreign(name, env_names()):
         return trust.component("env.name", name, f"{name}.ENV")
     if name not in env_names():
         raise BcrlError(f"env.name={name}: {did_you_mean(name, env_names())}")

@@ -75,7 +75,12 @@ class FiniteEnv(Env, Protocol):
 
 
 class Lanes(Protocol):
-    """Episodes of one env side by side, one a lane, in arrays of any leading axes."""
+    """Episodes of one env side by side, one per lane, in arrays of any leading axes.
+
+    A lane that fails gives states and rewards of 0 and is always cut.
+    """
+
+    failures: dict[int, str]  # lane, counted in C order → why it failed
 
     def begin(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
         """The states (…, d) of lanes that start as `initial` says."""
@@ -96,6 +101,9 @@ class Lanes(Protocol):
         state: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         """All states, anew from `start` in the lanes that are over."""
+
+    def close(self) -> None:
+        """Free what the lanes hold; they end here."""
 
 
 class SimulatedEnv(Env, Protocol):
@@ -121,6 +129,8 @@ class PureLanes:
 
     env: Env
 
+    failures: ClassVar[dict[int, str]] = {}
+
     def begin(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
         """The start states themselves."""
         return start
@@ -144,6 +154,9 @@ class PureLanes:
     ) -> NDArray[np.float64]:
         """The start states where it is over."""
         return np.where(over[..., None], start, state)
+
+    def close(self) -> None:
+        """Nothing is held."""
 
 
 def is_simulated(env: Env) -> bool:

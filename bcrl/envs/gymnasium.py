@@ -1,10 +1,11 @@
-"""Any Gymnasium environment with Box observations and Discrete actions."""
+"""Any Gymnasium environment whose observations are vectors and actions Discrete."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import gymnasium
@@ -14,11 +15,16 @@ from numpy.typing import NDArray
 
 from bcrl import trust
 from bcrl.envs import _simulators as simulators
+from bcrl.envs._contract import Simulator, plain_parts
+from bcrl.envs._lanes import SimulatedLanes
+from bcrl.envs._success import RULES, default
+from bcrl.envs._trial import TRIES, once, trial
 from bcrl.envs.base import check_episodes
 from bcrl.errors import BcrlError, ConfigError, at_least, did_you_mean
 
-SUCCESS = ("absorbed", "survived", "unpunished")
-TRIES = 5  # episodes in which two tasks have to differ
+MOST = 2**15 - 1  # actions, kept as int16
+RESCALE = "rescale: env.wrappers=[{name: RescaleObservation, min_obs: -1, max_obs: 1}]"
+RESCALE += " where the Box has bounds, else env.observation=module.function"
 
 
 @dataclass(frozen=True)
@@ -27,12 +33,12 @@ class Gymnasium:
 
     | | |
     |---|---|
-    | observation | the Box, flattened; or what `observation`, a function `module.name` that is trusted, makes of an observation |
+    | observation | the Box, Discrete, Tuple or Dict …, flattened; or what `observation`, a function `module.name` that is trusted, makes of an observation |
     | actions | the Discrete space's, counted from 0 |
     | dynamics | the environment's own; its randomness follows from the seed of each reset |
     | absorbing | terminated; truncated by a wrapper is cut, as at the horizon |
     | horizon | `horizon` steps, else the registered `max_episode_steps` |
-    | success | `absorbed`: the episode ended by itself; `survived`: it lasted to the horizon; `unpunished`: it ended with a reward of 0 or more |
+    | success | `success` names the rule: absorbed, survived, unpunished, rewarded, threshold (`success_threshold`, else the registered one) or info; `auto` chooses by random play |
 
     Tasks differ in `kwargs` of the constructor, in `attributes` set on the unwrapped
     environment, in `wrappers` ({name: …, arguments}) or in any other field.
@@ -48,57 +54,66 @@ class Gymnasium:
     observation: Any = None
     gamma: float = 0.99
     horizon: Any = None
-    success: str = "absorbed"
+    success: str = "auto"
+    success_threshold: Any = None
     starts: int = 20
     action_vectors: Any = None
     verify: bool = True
 
     name: ClassVar[str] = "gymnasium"
+    # n_actions, state_dim and first_action (what the simulator calls action 0) are
+    # set from a simulator's spaces and its first observation.
     initial_noise: ClassVar[int] = 1  # the seed of a reset
     step_noise: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
-        if self.success not in SUCCESS:
-            why = did_you_mean(str(self.success), SUCCESS)
-            raise ConfigError("env.success", self.success, why)
         at_least("env.starts", self.starts, 1)
         for key, kind in (("kwargs", dict), ("attributes", dict), ("wrappers", list)):
             value = getattr(self, key)
             if not isinstance(value, (kind, type(None))):
                 noun = "names and values" if kind is dict else "a list of sections"
                 raise ConfigError(f"env.{key}", value, f"must be {noun}, or null")
+        spec = simulators.spec_of(self.id)
         horizon = self.horizon
-        if horizon is None and (horizon := simulators.max_steps(self.id)) is None:
+        if horizon is None and (horizon := spec.max_episode_steps) is None:
             why = f"is needed: {self.id} has no limit of its own (a number of steps)"
             raise ConfigError("env.horizon", None, why)
         if type(horizon) is not int:
             raise ConfigError("env.horizon", horizon, "must be an integer, or null")
         object.__setattr__(self, "horizon", horizon)
         check_episodes(self.gamma, horizon)
-        space = self._simulator.action_space
-        if not isinstance(space, spaces.Discrete):
-            why = f"has actions {space}, only Discrete ones can be learned"
-            raise ConfigError("env.id", self.id, why)
-        seen = self._simulator.observation_space
-        if self.observation is None and not isinstance(seen, spaces.Box):
-            why = f"has observations {seen}, only a Box can be learned from; "
-            why += "env.observation=module.function makes an array of them"
-            raise ConfigError("env.id", self.id, why)
-        if self.observation is not None:
-            self._check_map()
+        self._resolve_success(spec.reward_threshold)
+        for name, value in _facts(_measured(self)).items():
+            object.__setattr__(self, name, value)
         if self.action_vectors is not None:
             self._check_vectors()
 
-    def _check_map(self) -> None:
-        try:
-            fits = self.state_dim > 0
-        except BcrlError:
-            raise
-        except Exception as error:  # whatever it does
-            why = f"{type(error).__name__}: {error}"
-            raise ConfigError("env.observation", self.observation, why) from error
-        if not fits:
-            raise ConfigError("env.observation", self.observation, "gives nothing")
+    def _resolve_success(self, registered: float | None) -> None:
+        """Name the rule of `auto`, and the threshold of the rule that needs one."""
+        rule, threshold = self.success, self.success_threshold
+        if rule not in (*RULES, "auto"):
+            why = did_you_mean(str(rule), (*RULES, "auto"))
+            raise ConfigError("env.success", rule, why)
+        if threshold is not None:
+            if type(threshold) not in (int, float) or not np.isfinite(threshold):
+                why = "must be a number, the return that counts as solved, or null"
+                raise ConfigError("env.success_threshold", threshold, why)
+            if rule not in ("auto", "threshold"):
+                why = f"has no effect with env.success={rule}; env.success=threshold"
+                raise ConfigError("env.success_threshold", threshold, why)
+            rule = "threshold"
+        elif rule == "threshold":
+            if (threshold := registered) is None:
+                why = f"is needed: {self.id} is registered without one (a return)"
+                raise ConfigError("env.success_threshold", None, why)
+        elif rule == "auto":
+            seen = trial(_measured(self))
+            found = default(seen.reports, seen.low, seen.high, registered)
+            rule, threshold = found.rule, found.threshold or None
+            once(f"env.id={self.id}: solved is env.success={found}")
+        threshold = None if rule != "threshold" else float(threshold)
+        object.__setattr__(self, "success", rule)
+        object.__setattr__(self, "success_threshold", threshold)
 
     def _check_vectors(self) -> None:
         try:
@@ -106,7 +121,7 @@ class Gymnasium:
         except (TypeError, ValueError):
             fits = False
         if not fits:
-            why = f"must be {self.n_actions} vectors of one length, one an action"
+            why = f"must be {self.n_actions} vectors of one length, one per action"
             raise ConfigError("env.action_vectors", self.action_vectors, why)
 
     def __hash__(self) -> int:
@@ -121,25 +136,6 @@ class Gymnasium:
         vectors = self.action_vectors
         return None if vectors is None else np.array(vectors, np.float64)
 
-    @functools.cached_property
-    def n_actions(self) -> int:
-        """Actions, 0 … n − 1."""
-        return int(self._simulator.action_space.n)
-
-    @functools.cached_property
-    def first_action(self) -> int:
-        """What the simulator calls action 0."""
-        return int(self._simulator.action_space.start)
-
-    @functools.cached_property
-    def state_dim(self) -> int:
-        """Entries of an observation."""
-        return len(self.observed(self._simulator.reset(seed=0)[0]))
-
-    @property
-    def _simulator(self) -> gymnasium.Env:
-        return _first(self)
-
     def simulator(self, render_mode: str | None = None) -> gymnasium.Env:
         """A new environment of this task, without a time limit."""
         parts = self.kwargs or {}, self.attributes or {}, self.wrappers or []
@@ -152,26 +148,29 @@ class Gymnasium:
 
         BcrlError if it draws none.
         """
-        lanes = simulators.SimulatedLanes(self, render_mode="rgb_array")
+        lanes = SimulatedLanes(self, render_mode="rgb_array")
         try:
             lanes.begin(start[None])
-            yield lanes.running[0].render()
+            yield self._picture(lanes)
             for action in actions:
                 lanes.step(None, action[None], None)
-                yield lanes.running[0].render()
-        except (gymnasium.error.Error, NotImplementedError, TypeError) as error:
+                yield self._picture(lanes)
+        finally:
+            lanes.close()
+
+    def _picture(self, lanes: SimulatedLanes) -> NDArray[np.uint8]:
+        for why in lanes.failures.values():
+            raise BcrlError(why)
+        try:
+            return lanes.running[0].env.render()
+        except Exception as error:  # of foreign code
             text = "pip install 'boosted-curriculum-rl[rendering]' may be what it needs"
             why = f"{type(error).__name__} {error}".strip()
             raise BcrlError(f"{self.id} draws nothing ({why}); {text}") from error
 
-    def observed(self, observation: Any) -> NDArray[np.float64]:
-        """An observation as a vector (d,)."""
-        if self.observation is not None:
-            observation = self._map(observation)
-        return np.asarray(observation, np.float64).reshape(-1)
-
     @functools.cached_property
-    def _map(self) -> Any:
+    def map(self) -> Any:
+        """The function `observation`."""
         name = str(self.observation)
         return trust.attribute("env.observation", name, name)
 
@@ -179,66 +178,50 @@ class Gymnasium:
         """What lanes are reset by: the noise (…, 1) itself."""
         return noise
 
-    def lanes(self) -> simulators.SimulatedLanes:
+    def lanes(self) -> SimulatedLanes:
         """Simulators side by side."""
-        return simulators.SimulatedLanes(self)
+        return SimulatedLanes(self)
 
     def evaluation_states(self) -> NDArray[np.float64]:
         """Observations after `starts` resets, always the same ones, (starts, d)."""
         numbers = (np.arange(self.starts) + 0.5) / self.starts
-        return self.lanes().begin(numbers[:, None])
+        lanes, found = SimulatedLanes(self), []  # one simulator is enough
+        try:
+            for number in numbers:
+                found.append(lanes.begin(np.full((1, 1), number))[0])
+                for why in lanes.failures.values():
+                    raise BcrlError(why)
+        finally:
+            lanes.close()
+        return np.array(found)
 
     @staticmethod
     def check_tasks(tasks: Sequence[Gymnasium]) -> None:
-        """Raise ConfigError for tasks that are alike, or don't repeat themselves."""
-        target = tasks[-1]
-        for number, task in enumerate(tasks[:-1], start=1):
-            after = tasks[number]
-            if target.verify and not differ(task, after):
+        """Raise BcrlError for tasks that are alike, or that break the contract.
+
+        Notes say what is adapted, and what float32 does not resolve.
+        """
+        trials = [trial(_measured(task)) for task in tasks]
+        for task, seen in zip(tasks, trials, strict=True):
+            if seen.unsteady:
+                why = f"{seen.unsteady} is another after the same reset and actions; "
+                why += "expected the same each time: randomness from reset(seed=…) "
+                why += "only, no state that outlives a reset or that simulators share"
+                raise ConfigError("env.id", task.id, why)
+            if seen.adapted:
+                once(f"env.id={task.id}: {'; '.join(seen.adapted)}")
+            if seen.coarse:
+                more = len(seen.coarse) - 1
+                text = f"{seen.coarse[0]}{f' ({more} more like it)' * (more > 0)}"
+                once(f"env.id={task.id}: {text}; {RESCALE}")
+        for number, (task, after) in enumerate(pairwise(tasks), start=1):
+            one, other = trials[number - 1 : number + 1]
+            same = (task.horizon, task.gamma) == (after.horizon, after.gamma)
+            if tasks[-1].verify and same and not one.differs(other):
                 why = f"tasks {number} and {number + 1} behave alike in {TRIES} "
                 why += "episodes of random play, so what differs may not be applied "
                 why += "(env.verify=false if that is as it should be)"
                 raise ConfigError("env.tasks", _difference(task, after), why)
-        for number, task in enumerate(tasks, start=1):
-            if task.verify and not repeats(task):
-                why = f"task {number} is another after the same reset and actions; "
-                why += "its randomness must come from reset(seed=…)"
-                raise ConfigError("env.id", task.id, why)
-
-
-@functools.lru_cache(maxsize=256)
-def repeats(task: Gymnasium) -> bool:
-    """Whether the first steps of an episode are the same a second time."""
-    return not _play_apart(task, task, min(50, task.horizon))
-
-
-@functools.lru_cache(maxsize=256)
-def differ(one: Gymnasium, other: Gymnasium) -> bool:
-    """Whether two tasks lead anywhere else under the same resets and actions."""
-    if one == other:
-        return False
-    if one.horizon != other.horizon or one.gamma != other.gamma:
-        return True
-    return _play_apart(one, other, one.horizon)
-
-
-def _play_apart(one: Gymnasium, other: Gymnasium, steps: int) -> bool:
-    """Whether anything differs in so many steps of random play."""
-    start = (np.arange(TRIES)[:, None] + 0.5) / TRIES
-    actions = np.random.default_rng(0).integers(one.n_actions, size=(steps, TRIES))
-    pair = [task.lanes() for task in (one, other)]
-    begun = [lanes.begin(start) for lanes in pair]
-    if not np.array_equal(*begun):
-        return True
-    alive = np.ones(TRIES, bool)
-    for action in actions:
-        a, b = (x.step(None, action[alive], None, alive) for x in pair)
-        if not all(map(np.array_equal, a, b)):
-            return True
-        alive[alive] = ~(a[2] | a[3])
-        if not alive.any():
-            break
-    return False
 
 
 def _difference(one: Gymnasium, other: Gymnasium) -> str:
@@ -253,16 +236,55 @@ def _fields(task: Gymnasium) -> dict[str, Any]:
     return {f.name: getattr(task, f.name) for f in fields(task)}
 
 
-@functools.lru_cache(maxsize=64)
-def _first(task: Gymnasium) -> gymnasium.Env:
-    """One simulator a task, to be asked for its spaces."""
+def _measured(task: Gymnasium) -> Gymnasium:
+    """The task without what does not show in its episodes."""
+    plain = {"success": "absorbed", "success_threshold": None, "action_vectors": None}
+    plain |= {"gamma": 0.0, "starts": 1}
+    if all(getattr(task, key) == value for key, value in plain.items()):
+        return task
+    return replace(task, **plain)
+
+
+@functools.lru_cache(maxsize=256)
+def _facts(task: Gymnasium) -> dict[str, int]:
+    """What a simulator's spaces and first observation say of a task."""
+    simulator = Simulator(task)
     try:
-        return task.simulator()
-    except BcrlError:
-        raise
-    except Exception as error:  # whatever a foreign constructor does
-        why = f"can't be made: {type(error).__name__}: {error}"
-        raise ConfigError("env.id", task.id, why) from error
+        space, actions = simulator.space, simulator.actions
+        if not isinstance(actions, spaces.Discrete):
+            why = f"has actions {actions}, only Discrete ones can be learned; "
+            why += (
+                "env.wrappers=[{name: DiscretizeAction, bins: 5}]"
+                * isinstance(actions, spaces.Box)
+                or "a wrapper of your own can number them"
+            )
+            raise ConfigError("env.id", task.id, why)
+        if not 1 <= actions.n <= MOST:
+            why = f"has {actions.n} actions, from 1 to {MOST} can be learned"
+            raise ConfigError("env.id", task.id, why)
+        if not isinstance(space, spaces.Space):
+            came = f"{space!r} of type {type(space).__module__}.{type(space).__name__}"
+            raise simulator.broken("observation_space", came, "a space of gymnasium's")
+        if task.observation is None and not plain_parts(space):
+            raise ConfigError("env.id", task.id, _no_vector(task, space))
+        seen = simulator.reset(seed=0)
+    finally:
+        simulator.close()
+    facts = {"n_actions": int(actions.n), "first_action": int(actions.start)}
+    return facts | {"state_dim": len(seen)}
+
+
+def _no_vector(task: Gymnasium, space: spaces.Space) -> str:
+    """Why observations can't be learned from, and what makes a vector of them."""
+    why = f"has observations {space}, which are no vector of a fixed length; "
+    if task.id.startswith("minigrid:"):
+        why += "env.wrappers=[{name: minigrid.wrappers.ImgObsWrapper}], or "
+    if isinstance(space, spaces.Dict):
+        keys = [key for key, part in space.spaces.items() if plain_parts(part)]
+        if keys:
+            listed = f"filter_keys: [{', '.join(map(str, keys))}]"
+            why += f"env.wrappers=[{{name: FilterObservation, {listed}}}], or "
+    return f"{why}env.observation=module.function makes an array of them"
 
 
 def _made(fields: dict[str, Any]) -> Gymnasium:
