@@ -167,6 +167,7 @@ class SimulatedLanes:
     length: NDArray[np.intp] | None = None  # (…) how many of them
     running: list[gymnasium.Env] = field(default_factory=list, metadata=DERIVED)
     render_mode: str | None = None
+    failures: dict[int, str] = field(default_factory=dict, metadata=DERIVED)
 
     def begin(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
         """Reset every lane; the observations (…, d)."""

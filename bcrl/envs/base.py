@@ -77,6 +77,10 @@ class FiniteEnv(Env, Protocol):
 class Lanes(Protocol):
     """Episodes of one env side by side, one a lane, in arrays of any leading axes."""
 
+    #: Lanes whose simulator failed, counted in C order, and why. Such a lane gives
+    #: zeros and is cut at every step; the others don't notice.
+    failures: dict[int, str]
+
     def begin(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
         """The states (…, d) of lanes that start as `initial` says."""
 
@@ -120,6 +124,7 @@ class PureLanes:
     """Lanes of an env whose steps are pure functions: the caller has the states."""
 
     env: Env
+    failures: ClassVar[dict[int, str]] = {}
 
     def begin(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
         """The start states themselves."""
@@ -132,8 +137,8 @@ class PureLanes:
         noise: NDArray[np.float64],
         lanes: Any = ...,
     ) -> tuple[NDArray, NDArray, NDArray, NDArray | bool]:
-        """`step`, or `push` if the actions are forces; never cut."""
-        step = self.env.push if action.dtype == np.float64 else self.env.step
+        """`step` for actions (…), `push` for forces (…, k); never cut."""
+        step = self.env.push if action.ndim == state.ndim else self.env.step
         return *step(state, action, noise), False
 
     def restart(

@@ -86,7 +86,7 @@ class LSPI:
             policy,
             self.evaluation_episodes,
             np.full(len(gain), np.nan),
-            failed,
+            failed=failed,
         )
 
     def _collect(
