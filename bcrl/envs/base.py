@@ -49,6 +49,8 @@ class Env(Protocol):
 class ContinuousEnv(Env, Protocol):
     """An env that takes any vector as its action; LSPI learns in its LQ tasks."""
 
+    positions: ClassVar[tuple[int, ...]]  # which entry of the state each force moves
+
     @property
     def linear_quadratic(self) -> tuple[NDArray[np.float64], ...] | None:
         """A, B, Q, R of s' = A s + B a, reward −s'ᵀ Q s' − aᵀ R a; None if not so."""
