@@ -154,20 +154,17 @@ def _lspi(settings: Settings, env: Env, own: dict[str, Any], warm: bool) -> LSPI
     if warm:
         why = "leaves no network to start DQN's from: boosting=on or a transfer needed"
         raise ConfigError("algorithm.learners", "lspi", why)
-    chosen, steps = _lspi_settings(settings), own["steps"]
-    episodes, rest = divmod(steps, chosen.iterations * env.horizon)
-    if rest or not episodes:
-        why = f"LSPI needs a multiple of {chosen.iterations} iterations x {env.horizon}"
-        raise ConfigError("algorithm.steps", steps, f"{why} steps")
-    return LSPI(
+    chosen = _lspi_settings(settings)
+    learner = LSPI(
         chosen.iterations,
-        episodes,
+        own["steps"],
         float(chosen.noise_std),
         chosen.features,
         chosen.drop_last,
         own["evaluation_episodes"],
-        env.horizon,
     )
+    learner.episodes(env)  # which says whether they are whole
+    return learner
 
 
 def _lspi_settings(settings: Settings) -> LSPISettings:
