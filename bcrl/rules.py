@@ -186,10 +186,7 @@ def _check_lspi(chosen: Composition, slot: int, learner: LSPI) -> None:
     if not 0 < learner.noise_std < math.inf:
         why = "must be above 0: without noise LSTDQ sees one action per state"
         raise ConfigError("algorithm.lspi.noise_std", learner.noise_std, why)
-    horizon = chosen.slots[slot].horizon
-    if learner.horizon != horizon:
-        why = f"the task has {horizon} steps: LSPI(horizon={horizon})"
-        raise ConfigError("algorithm.lspi.horizon", learner.horizon, why)
+    learner.episodes_per_iteration(chosen.slots[slot])  # raises
 
 
 def _check_numbers(section: str, learner: FQI | DQN | LSPI) -> None:

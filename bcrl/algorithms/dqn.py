@@ -74,7 +74,7 @@ def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
             kind = "lspi" if quadratic and first else "dqn"
         if kind == "lspi":
             check_lspi(chosen, slot, "lspi")
-            learners.append(_lspi(lspi, env.horizon, own))
+            learners.append(_lspi(lspi, own))
         else:
             learners.append(
                 DQN(
@@ -105,20 +105,15 @@ def _per_task(settings: Settings, n: int) -> dict[str, list]:
     }
 
 
-def _lspi(chosen: LSPISettings, horizon: int, own: dict[str, Any]) -> LSPI:
-    """LSPI with a slot's steps, which must be a multiple of its iterations'."""
-    episodes, rest = divmod(own["steps"], chosen.iterations * horizon)
-    if rest or not episodes:
-        why = f"LSPI needs a multiple of {chosen.iterations} iterations x {horizon}"
-        raise ConfigError("algorithm.steps", own["steps"], f"{why} steps")
+def _lspi(chosen: LSPISettings, own: dict[str, Any]) -> LSPI:
+    """LSPI with a slot's steps."""
     return LSPI(
         chosen.iterations,
-        episodes,
+        own["steps"],
         float(chosen.noise_std),
         chosen.features,
         chosen.drop_last,
         own["evaluation_episodes"],
-        horizon,
     )
 
 
