@@ -77,6 +77,7 @@ def test_what_a_run_leaves(tmp_path):
         document["sha256"]["csv"] = hashlib.sha256(form.encode()).hexdigest()
         for table in (pd.read_csv(io.StringIO(form)), read_csv(path, document)):
             assert table["loss"].dtype == float and table["loss"].isna().sum() == 6
+    assert api.read(p.directory)["loss"].dtype == float
     assert all(-150 <= r["return"] <= 0 for r in found[5:])
     about = json.loads((p.directory / "seed_0000.json").read_text())
     assert about["status"] == "complete" and about["learners"] == ["lspi", "dqn"]
