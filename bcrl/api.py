@@ -159,13 +159,14 @@ def _seeds(seeds: Iterable[int]) -> tuple[int, ...]:
 
 
 def _rows(now: Snapshot, probe: probes.Probe | StepProbe, seeds: Sequence[int]) -> list:
-    if now.failed:
-        lost = ", ".join(f"seed {seeds[s]}: {why}" for s, why in now.failed.items())
+    rows = probe.measure(now)
+    if probe.failed:
+        lost = ", ".join(f"seed {seeds[s]}: {why}" for s, why in probe.failed.items())
         raise BcrlError(f"at {probe.index} {now.count}: {lost}")
     where = {"stage": now.stage.number, "task": now.stage.task, probe.index: now.count}
     return [
         {"seed": seed} | where | measured
-        for seed, measured in zip(seeds, probe.measure(now), strict=True)
+        for seed, measured in zip(seeds, rows, strict=True)
     ]
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, get_type_hints
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
@@ -71,36 +73,63 @@ def one_of(key: str, value: object, allowed: Sequence[str]) -> None:
 def construct(section: str, cls: type, values: Mapping[str, Any]) -> Any:
     """`cls(**values)` with every key known and every value of its annotated type.
 
-    Raises ConfigError naming `section.key` otherwise.
+    A list is taken for a tuple. Raises ConfigError naming `section.key` otherwise.
     """
-    kinds = get_type_hints(cls)
-    hints = {f.name: kinds[f.name] for f in dataclasses.fields(cls)}
+    fields, taken = {f.name: f for f in dataclasses.fields(cls)}, {}
+    hints = _hints(cls)
     for key, value in values.items():
-        if key not in hints:
-            raise ConfigError(
-                f"{section}.{key}", value, f"unknown key; {did_you_mean(key, hints)}"
-            )
-        if not _fits(value, hints[key]):
-            kind = getattr(hints[key], "__name__", hints[key])
-            raise ConfigError(f"{section}.{key}", value, f"must be of type {kind}")
-    missing = [
-        f.name
-        for f in dataclasses.fields(cls)
-        if f.name not in values
-        and f.default is dataclasses.MISSING
-        and f.default_factory is dataclasses.MISSING
-    ]
-    if missing:
-        raise ConfigError(f"{section}.{missing[0]}", None, "is required")
-    return cls(**values)
+        place = f"{section}.{key}"
+        if key not in fields:
+            raise ConfigError(place, value, f"unknown key; {did_you_mean(key, fields)}")
+        hint = hints.get(key, Any)
+        try:
+            taken[key] = _taken(value, hint)
+        except TypeError:
+            name = getattr(hint, "__name__", hint) if isinstance(hint, type) else hint
+            kind = str(name).replace("typing.", "")
+            raise ConfigError(place, value, f"must be of type {kind}") from None
+    for key, field_ in fields.items():
+        lacks = field_.default is field_.default_factory is dataclasses.MISSING
+        if lacks and key not in values:
+            raise ConfigError(f"{section}.{key}", None, "is required")
+    return cls(**taken)
 
 
-def _fits(value: object, hint: Any) -> bool:
-    if hint is Any:
-        return True
-    if hint is float:
-        return type(value) in (int, float) and math.isfinite(value)
-    return type(value) is hint
+def _hints(cls: type) -> dict[str, Any]:
+    """The annotated types of a class; none if some can't be found."""
+    try:
+        return get_type_hints(cls)
+    except Exception:  # of the user's file, which imports them for type checkers only
+        return {}
+
+
+def _taken(value: Any, hint: Any) -> Any:
+    """A plain value as a field of type `hint` takes it; TypeError if it doesn't fit."""
+    kind, of = get_origin(hint) or hint, get_args(hint)
+    if kind in (Union, UnionType):
+        for each in of:
+            with contextlib.suppress(TypeError):
+                return _taken(value, each)
+    elif kind is Literal:
+        if any(type(value) is type(each) and value == each for each in of):
+            return value
+    elif kind is float:
+        if type(value) in (int, float) and math.isfinite(value):
+            return value
+    elif kind in (Any, object) or not isinstance(kind, type):
+        return value  # nothing that could be checked
+    elif type(value) is list and (kind is tuple or issubclass(list, kind)):
+        one = len(of) == 1 or of[1:] == (...,)  # type for all entries
+        hints = of[:1] * len(value) if one else of or [Any] * len(value)
+        if len(hints) == len(value):
+            made = list(map(_taken, value, hints))
+            return tuple(made) if kind is tuple else made
+    elif type(value) is dict and issubclass(kind, Mapping):
+        of = of or (Any, Any)
+        return {_taken(k, of[0]): _taken(v, of[1]) for k, v in value.items()}
+    elif type(value) is kind:
+        return value
+    raise TypeError
 
 
 def per_task(
@@ -114,7 +143,8 @@ def per_task(
         )
     bounds = f"at least {least:g}" if most == math.inf else f"in [{least:g}, {most:g}]"
     for entry in values:
-        if not _fits(entry, kind) or not least <= entry <= most:
+        kinds = (int, float) if kind is float else (int,)
+        if type(entry) not in kinds or not least <= entry <= most:
             noun = "integer" if kind is int else "number"
             raise ConfigError(key, value, f"every entry must be one {noun} {bounds}")
     return [kind(entry) for entry in values]

@@ -23,6 +23,17 @@ class ConfigError(BcrlError):
         return type(self), (self.key, self.value, self.allowed)
 
 
+class SeedsFailed(BcrlError):
+    """Some seeds of a team can't go on; `reasons` says why, by place in the team."""
+
+    def __init__(self, reasons: dict[int, str]) -> None:
+        super().__init__("; ".join(dict.fromkeys(reasons.values())))
+        self.reasons = reasons
+
+    def __reduce__(self) -> tuple:
+        return type(self), (self.reasons,)
+
+
 def at_least(key: str, value: int | None, least: int) -> None:
     """Raise ConfigError if `value` is below `least`; None passes."""
     if value is not None and value < least:

@@ -44,13 +44,16 @@ def _evaluate(
         "discounted_return": played.discounted_return(env.gamma),
         "success_rate": played.solved(success_of(env)),
     }
-    best = np.asarray(now.learned.q(start, env.n_actions)).max(-1)
+    first = np.ascontiguousarray(played.state[:, :n, 0])  # what was seen, not `start`
+    best = np.asarray(now.learned.q(first, env.n_actions)).max(-1)
     rows = [
         {name: float(values[s, :n].mean()) for name, values in outcomes.items()}
         | {"q_mean": float(best[s].mean()), "loss": float(now.loss[s])}
         | {f"greedy_{k}": float(values[s, n:].mean()) for k, values in outcomes.items()}
         for s in range(len(seeds))
     ]
+    for s in played.failed:  # void, but for the loss
+        rows[s] |= dict.fromkeys(rows[s].keys() - {"loss"}, np.nan)
     return rows, played
 
 
@@ -62,6 +65,8 @@ class StepProbe:
     tasks: Sequence[Env]
     #: At each stage's end: who has learned it, and Q at `states` (S, n, A).
     kept: list[tuple[str, NDArray[np.float32]]] = field(default_factory=list)
+    #: By place, which seeds can't go on after the latest measurement, and why.
+    failed: dict[int, str] = field(default_factory=dict)
 
     index: ClassVar[str] = "step"  # what a moment's count is
 
@@ -74,6 +79,7 @@ class StepProbe:
     def measure(self, now: Moment) -> list[dict[str, float]]:
         """Each seed's row of the CSV."""
         rows, played = _evaluate(now, self.seeds)
+        self.failed = played.failed | now.failed
         if now.last_of_stage:
             self._shown, self._first = played, now.episodes  # the first greedy one
             env, n = now.stage.env, len(self.seeds)

@@ -27,8 +27,13 @@ _PLAIN = (type(None), bool, int, float, str)
 
 def storable(cls: type) -> type:
     """Mark a dataclass as one whose instances are packed field by field."""
-    _STORABLE[cls.__name__] = cls
+    _STORABLE[_name(cls)] = cls
     return cls
+
+
+def _name(cls: type) -> str:
+    """What a class is called in a file: a user's `Sum` is another than ours."""
+    return f"{cls.__module__}.{cls.__qualname__}"
 
 
 def write(file: BinaryIO, about: dict, content: Any, given: Sequence[Any]) -> None:
@@ -117,10 +122,10 @@ class _Packer:
             return [name, [self.pack(each) for each in thing]]
         if kind is dict:
             return [name, [[self.pack(k), self.pack(v)] for k, v in thing.items()]]
-        if _STORABLE.get(name) is kind:
+        if _STORABLE.get(_name(kind)) is kind:
             fields = {f.name: self.pack(getattr(thing, f.name)) for f in _fields(kind)}
-            return ["object", name, fields]
-        raise TypeError(f"{kind.__module__}.{name} is not storable")
+            return ["object", _name(kind), fields]
+        raise TypeError(f"{_name(kind)} is not storable")
 
     def _array(self, kind: str, array: NDArray) -> list:
         order = (

@@ -13,6 +13,7 @@ TIE = 1e-9  # distances between actions that differ by less are equal
 
 @numba.njit
 def _best(q, u):
+    """The greatest of q (A,), ties broken by u in [0, 1); 0 where NaN hides it."""
     best, ties = q[0], 1
     for a in range(1, len(q)):
         if q[a] > best:
@@ -25,7 +26,7 @@ def _best(q, u):
             if rank == 0:
                 return a
             rank -= 1
-    return 0  # values that are not numbers
+    return 0
 
 
 @per_lane("(f8[:], f8, i8[:])", "(a),()->()")
@@ -64,3 +65,35 @@ def combined(actions: NDArray[np.float64]) -> NDArray[np.intp]:
     table = np.where(near, from_own[None], np.inf).argmin(-1)
     own = np.broadcast_to(np.arange(len(actions)), table.shape)
     return np.where(np.linalg.norm(aim, axis=-1) < TIE, own, table)
+
+
+@numba.njit(cache=True, nogil=True)
+def walk(next_row, reward, absorbing, q, first, u, epsilon):
+    """One seed's ε-greedy episodes in a finite task, row by row from `first` (E,).
+
+    next_row, reward, absorbing, q: tables (N, A); u: uniforms (T, E, 2 or more).
+    Returns rows (E, T + 1), actions (E, T) and lengths (E,). It stands beside `_best`
+    because numba's cache of a file doesn't see changes of another.
+    """
+    horizon, episodes = u.shape[0], u.shape[1]
+    n_actions = q.shape[1]
+    row = np.empty((episodes, horizon + 1), np.intp)
+    action = np.zeros((episodes, horizon), np.intp)
+    length = np.zeros(episodes, np.intp)
+    for e in range(episodes):
+        at = first[e]
+        row[e, 0] = at
+        for t in range(horizon):
+            if u[t, e, 0] < epsilon:
+                act = int(u[t, e, 1] * n_actions)
+            else:
+                act = _best(q[at], u[t, e, 1])
+            action[e, t] = act
+            length[e] = t + 1
+            done = absorbing[at, act]
+            at = next_row[at, act]
+            row[e, t + 1] = at
+            if done:
+                break
+        row[e, length[e] + 1 :] = at
+    return row, action, length

@@ -90,6 +90,8 @@ class Probe:
     tasks: Sequence[Env]
     metrics: Sequence[str]
     kept: list[Values] = field(default_factory=list)  # residuals at each stage's end
+    #: By place, which seeds can't go on after the latest measurement, and why.
+    failed: dict[int, str] = field(default_factory=dict)
 
     index: ClassVar[str] = "iteration"  # what a snapshot's count is
 
@@ -119,6 +121,7 @@ class Probe:
         start = np.stack([evaluation_starts(rng, env) for rng in rngs])
         u = np.stack([draws(rng, env, start.shape[1]) for rng in rngs])
         episodes = rollout(env, snapshot.learned.q, start, u)
+        self.failed = episodes.failed | snapshot.failed
         returns = episodes.discounted_return(env.gamma)
         solved = episodes.solved(success_of(env))
         start_rows, rows, q_star = _layout(env, self.target)
@@ -138,7 +141,13 @@ class Probe:
         if snapshot.last_of_stage:
             self.kept.append(snapshot.probed_residual)
             self._last = snapshot
-        return [{m: float(METRICS[m](v)) for m in self.metrics} for v in views]
+        return [
+            {
+                m: float("nan" if s in self.failed else METRICS[m](v))
+                for m in self.metrics
+            }
+            for s, v in enumerate(views)
+        ]
 
     def arrays(self, s: int) -> dict[str, NDArray]:
         """What seed number s ends with: Q and residuals at the probed states."""
@@ -159,7 +168,9 @@ class Probe:
         rngs = [stream(seed, "evaluation", now.count) for seed in self.seeds]
         start = np.stack([start_states(rng, self.target, 1) for rng in rngs])
         u = np.stack([draws(rng, self.target, 1) for rng in rngs])
-        return rollout(self.target, now.learned.q, start, u)
+        shown = rollout(self.target, now.learned.q, start, u)
+        self.failed = shown.failed | self.failed
+        return shown
 
     def facts(self) -> dict[str, Any]:
         """What else is known of the run."""

@@ -130,7 +130,8 @@ def write_seed(
 ) -> None:
     """One seed's CSV, NPZ and, last, JSON, which has the hashes of both."""
     lines = [",".join(rows[0])]
-    lines += [",".join(repr(value) for value in row.values()) for row in rows]
+    # A value that is missing (NaN) is an empty cell, as in the report's tables.
+    lines += [",".join(repr(x) if x == x else "" for x in row.values()) for row in rows]
     text = "\n".join(lines) + "\n"
     packed = io.BytesIO()
     np.savez(packed, **dict(arrays))

@@ -5,15 +5,14 @@ from __future__ import annotations
 import functools
 from collections import ChainMap
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.envs import Env, Success, is_finite, is_simulated, lanes_of
-from bcrl.policies import greedy, uniform
-from bcrl.q import Q, Table
+from bcrl.policies import greedy, uniform, walk
+from bcrl.q import NOT_FINITE, Q, Table, ask, rows_of
 
 AT_ONCE = 128  # simulators that exist at a time in `play`
 CHOICES = 3  # uniforms a step-wise decision takes: explore? which action? the prior's
@@ -29,6 +28,8 @@ class Episodes:
     absorbing: NDArray[np.bool_]  # (S, E, T)
     length: NDArray[np.intp]  # (S, E)
     start: NDArray[np.float64]  # (S, E, …) what `env.initial` gave
+    #: Seeds, by place, whose simulator or Q failed, and why: their episodes are void.
+    failed: dict[int, str] = field(default_factory=dict)
     reported: NDArray[np.bool_] | None = None  # (S, E) success, as a simulator says
 
     def discounted_return(self, gamma: float) -> NDArray[np.float64]:
@@ -100,17 +101,20 @@ def rollout(
     """ε-greedy episodes from start (S, E, d) with uniforms u (S, T, E, 2 + noise)."""
     if is_finite(env) and isinstance(q, Table):
         return _tabular_rollout(env, q, start, u, epsilon)
+    failed: dict[int, str] = {}
 
     def epsilon_greedy(now: NDArray, u: NDArray, alive: NDArray) -> NDArray:
         act = uniform(env.n_actions, u[..., 1])
         exploit = alive & (u[..., 0] >= epsilon)
         if exploit.any():  # Q may be dear: ask it only where it decides
             asked = [x[lanes] for x, lanes in zip(now, exploit, strict=True)]
-            values = np.concatenate(q(asked, env.n_actions))
-            act[exploit] = greedy(values, u[..., 1][exploit])
+            values, lost = ask(q, asked, env.n_actions)
+            failed.update(lost)
+            act[exploit] = greedy(np.concatenate(values), u[..., 1][exploit])
         return act
 
-    return play(env, epsilon_greedy, start, u)
+    played = play(env, epsilon_greedy, start, u)
+    return replace(played, failed=failed | played.failed)
 
 
 def play(
@@ -155,7 +159,8 @@ def play(
     by_lane = [np.ascontiguousarray(np.moveaxis(part, 0, 2)) for part in parts]
     reported = getattr(running, "succeeded", None)
     running.close()
-    return Episodes(*by_lane, length, start, reported)
+    failed = {lane // n_episodes: why for lane, why in running.failures.items()}
+    return Episodes(*by_lane, length, start, failed, reported)
 
 
 def _in_parts(
@@ -179,7 +184,7 @@ def _in_parts(
 
         played.append(play(env, decide, start[:, part], u[:, :, part]))
     joined = {}
-    for name in (field.name for field in fields(Episodes)):
+    for name in (each.name for each in fields(Episodes)):
         values = [getattr(each, name) for each in played]
         if isinstance(values[0], dict):  # by seed
             joined[name] = dict(ChainMap(*values))
@@ -197,7 +202,7 @@ def transition_tables(
     every = np.repeat(states[:, None], env.n_actions, axis=1)
     actions = np.broadcast_to(np.arange(env.n_actions), every.shape[:2])
     after, reward, absorbing = env.step(every, actions)
-    return env.index(after), reward, absorbing
+    return rows_of(env, after), reward, absorbing
 
 
 def _tabular_rollout(
@@ -205,51 +210,15 @@ def _tabular_rollout(
 ) -> Episodes:
     """`rollout` on a finite environment, walked row by row in compiled code."""
     tables = transition_tables(env)
-    first = env.index(start)
+    first = rows_of(env, start)
     walked = [
-        _walk(*tables, values, first[s], u[s], epsilon)
+        walk(*tables, values, first[s], u[s], epsilon)
         for s, values in enumerate(q.values)
     ]
     row, action, length = (np.stack(part) for part in zip(*walked, strict=True))
     void = np.arange(u.shape[1]) >= length[..., None]
     _, reward, absorbing = (table[row[..., :-1], action] for table in tables)
     reward[void], absorbing[void] = 0.0, False
-    return Episodes(env.states()[row], action, reward, absorbing, length, start)
-
-
-@numba.njit(cache=True, nogil=True)
-def _walk(next_row, reward, absorbing, q, first, u, epsilon):
-    """Rows (E, T + 1), actions (E, T) and lengths (E,) of one seed's episodes."""
-    horizon, episodes = u.shape[0], u.shape[1]
-    n_actions = q.shape[1]
-    row = np.empty((episodes, horizon + 1), np.intp)
-    action = np.zeros((episodes, horizon), np.intp)
-    length = np.zeros(episodes, np.intp)
-    for e in range(episodes):
-        at = first[e]
-        row[e, 0] = at
-        for t in range(horizon):
-            if u[t, e, 0] < epsilon:
-                act = int(u[t, e, 1] * n_actions)
-            else:  # as policies.greedy, whose code a cache of this file can't follow
-                best, ties = q[at, 0], 1
-                for a in range(1, n_actions):
-                    if q[at, a] > best:
-                        best, ties = q[at, a], 1
-                    elif q[at, a] == best:
-                        ties += 1
-                rank = int(u[t, e, 1] * ties)
-                act = -1
-                while rank >= 0:
-                    act += 1
-                    if q[at, act] == best:
-                        rank -= 1
-            action[e, t] = act
-            length[e] = t + 1
-            done = absorbing[at, act]
-            at = next_row[at, act]
-            row[e, t + 1] = at
-            if done:
-                break
-        row[e, length[e] + 1 :] = at
-    return row, action, length
+    finite = [np.isfinite(values).all() for values in q.values]
+    failed = {s: NOT_FINITE for s, known in enumerate(finite) if not known}
+    return Episodes(env.states()[row], action, reward, absorbing, length, start, failed)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.envs import Env
+from bcrl.errors import BcrlError
 from bcrl.pack import storable
 from bcrl.q import ZERO
 from bcrl.rollout import Policy
@@ -41,11 +42,8 @@ class Snapshot(Pause):
 
     last_of_stage: bool
     learned: Learned
-
-    @property
-    def failed(self) -> dict[int, str]:
-        """Which of the S seeds can't go on, and why."""
-        return {}
+    #: Which of the S seeds can't go on, by place in the team, and why.
+    failed: dict[int, str] = field(default_factory=dict, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -57,11 +55,6 @@ class Moment(Snapshot):
     )
     episodes: int
     loss: NDArray[np.float64]  # (S,) mean since the last moment; nan without updates
-    failures: dict[int, str] = field(default_factory=dict)
-
-    @property
-    def failed(self) -> dict[int, str]:
-        return self.failures
 
 
 class Learner(Protocol):
@@ -121,9 +114,14 @@ class Course:
     def __iter__(self) -> Iterator[Pause]:
         for stage in self.stages[self._past.stages :]:
             start, state = begin(stage.transfers, self._past.learned), self._past.state
+            now = None
             for now in stage.learner.learn(stage, start, self.team, state):
                 self._now = now
                 yield now
+            if not (isinstance(now, Snapshot) and now.last_of_stage):
+                text = "must yield a last Snapshot, with last_of_stage=True"
+                name = getattr(stage.learner, "name", type(stage.learner).__name__)
+                raise BcrlError(f"{name}.learn: stage {stage.number} {text}")
             self._past = Past(stage.number, now.learned)
 
     @property

@@ -102,7 +102,7 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> Outcome:
             checkpoints.remove_done(plan)
             return Outcome(outcome.failed, busy, outcome.interrupted)
     except Exception as error:
-        if not isinstance(error, BcrlError):  # unforeseen: show where it came from
+        if not isinstance(error, (BcrlError, MemoryError)):  # unforeseen: show where
             say(traceback.format_exc())
         who = f"{plan.env} {plan.name}, {named(mine)}"
         say(f"{who}: failed: {_reason(error)}")
@@ -202,12 +202,13 @@ def _record(
     for place, seed in enumerate(seeds):
         if seed not in new:
             continue
-        why, status = session.failed.get(place), "complete"
+        arrays = probe.arrays(place)
+        why, status = session.failed.get(place) or probe.failed.get(place), "complete"
         if why:
             failed[seed], status = why, f"failed: {why}"
             say(f"{plan.env} {plan.name}: seed {seed} {status}")
         _check_locks(plan, held)
-        rows, arrays = session.rows[place], probe.arrays(place)
+        rows = session.rows[place]
         records.write_seed(plan, seed, status, rows, arrays, facts | job.origin)
     return failed
 
@@ -220,7 +221,7 @@ def _look(probe: Probe | StepProbe, now: Snapshot, session: Session, log: Log) -
     log(probe.index, new)
     for known, added in zip(session.rows, new, strict=True):
         known += added
-    for place, why in now.failed.items():
+    for place, why in probe.failed.items():
         session.failed.setdefault(place, f"{why} at {probe.index} {now.count}")
 
 
@@ -240,6 +241,9 @@ def _note_failure(plan: Plan, seeds: Seeds, error: Exception) -> None:
 
 
 def _reason(error: Exception) -> str:
+    if isinstance(error, MemoryError):
+        what = "try fewer workers or seeds.lockstep, or a smaller scale"
+        return " ".join(f"out of memory: {error} ({what})".split())
     known = isinstance(error, BcrlError)
     return str(error) if known else f"{type(error).__name__}: {error}"
 

@@ -1,10 +1,12 @@
 """Whole DQN runs at smoke scale: records, identical bytes, diverging seeds, the GPU."""
 
 import csv
+import io
 import json
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -32,7 +34,8 @@ def run(folder, *overrides: str):
 
 def rows(p, seed: int) -> list[dict[str, float]]:
     lines = csv.DictReader((p.directory / f"seed_{seed:04d}.csv").open())
-    return [{k: float(v) for k, v in line.items()} for line in lines]
+    # A missing value is an empty cell.
+    return [{k: float(v or "nan") for k, v in line.items()} for line in lines]
 
 
 @pytest.mark.parametrize("variant", METHODS + RELEASED)
@@ -63,6 +66,10 @@ def test_what_a_run_leaves(tmp_path):
     ]
     assert all(math.isfinite(v) for r in found for k, v in r.items() if k != "loss")
     assert [math.isnan(r["loss"]) for r in found] == [True] * 6 + [False]
+    text = (p.directory / "seed_0000.csv").read_text()
+    assert "nan" not in text and text.splitlines()[1].split(",")[7] == ""
+    table = pd.read_csv(io.StringIO(text))
+    assert table["loss"].dtype == float and table["loss"].isna().sum() == 6
     assert all(-150 <= r["return"] <= 0 for r in found[5:])
     about = json.loads((p.directory / "seed_0000.json").read_text())
     assert about["status"] == "complete" and about["learners"] == ["lspi", "dqn"]

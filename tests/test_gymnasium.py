@@ -6,13 +6,20 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+import torch
+from torch.nn import functional
 
 from bcrl import pack, runner
 from bcrl.api import DQN, FQI, Boost, Forest, Gymnasium, run, stages
 from bcrl.errors import BcrlError, ConfigError
+from bcrl.evaluation import evaluate
+from bcrl.q.quadratic import Quadratic
 from bcrl.rollout import draws, play, start_states
+from bcrl.stage import Team, snapshots
 from bcrl.streams import stream
+from bcrl.transfer import Start
 from tests.conftest import plan, plans
+from tests.toys import last
 
 CAR = {"id": "MountainCar-v0", "horizon": 40}
 CURRICULA = ("mountain_car", "cart_pole", "acrobot")
@@ -101,6 +108,40 @@ def test_truncation_bootstraps_in_dqn():
     position, discount = kept[:, 0], kept[:, 2 + task.n_actions + 1]
     assert set(position.tolist()) == {0.0, 1.0, 2.0}  # anew after three steps
     assert (discount == np.float32(task.gamma)).all()
+
+
+def test_q_mean_is_that_of_the_first_observations():
+    """Against plain Gymnasium and torch's own layers."""
+    task, seed, n = Gymnasium(**CAR), 5, 7
+    learner = DQN(20, 5, 10, hidden=(9, 6), evaluate_every=20, evaluation_episodes=n)
+    (stage,) = stages([task], learner)
+    team = Team((3, seed), np.zeros((1, 2)))
+    env = gymnasium.make(CAR["id"])
+    for now in snapshots(learner.learn(stage, Start(), team)):
+        resets = stream(seed, "evaluation", 1, now.count).random(n) * 2**31
+        seen = np.stack([env.reset(seed=int(number))[0] for number in resets])
+        sizes, flat, at = (2, 9, 6, 3), now.learned.residual.online.flat[1], 0
+        x = torch.from_numpy(seen)
+        for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
+            weights = flat[at : at + n_in * n_out].view(n_in, n_out)
+            at += n_in * n_out + n_out
+            x = functional.linear(x, weights.T, flat[at - n_out : at])
+            x = functional.relu(x) if layer < 2 else x
+        expected = x.max(-1).values.mean().item()
+        found = evaluate(now, team.seeds)[1]["q_mean"]
+        assert found == pytest.approx(expected, rel=1e-5)
+
+
+def test_what_resets_a_simulator_is_refused_as_a_state():
+    task = Gymnasium(**CAR)
+    numbers = task.initial(np.full((1, 4, 1), 0.5))
+    (stage,) = stages([task], DQN(3, 0, hidden=(4,), evaluation_episodes=1))
+    deep = last(snapshots(stage.learner.learn(stage, Start(), Team((0,), numbers))))
+    quadratic = Quadratic(np.eye(3)[None], np.zeros((1, 3)), np.ones((2, 1)))
+    for q in (deep.learned.q, quadratic):
+        for states in (numbers, list(numbers)):
+            with pytest.raises(BcrlError, match=r"2 entries.* 1"):
+                q(states, 3)
 
 
 def _alone(task, learner):

@@ -249,3 +249,13 @@ def test_the_lq_matrices_are_those_of_a_step(preset):
         after, reward, _ = env.push(s, f, np.full(8, 0.5))
         assert np.allclose(after, a @ s + b @ f, atol=1e-14)
         assert reward == pytest.approx(-after @ q @ after - f @ r @ f, rel=1e-12)
+
+
+@pytest.mark.parametrize("preset", ["released", "paper"])
+@pytest.mark.parametrize("task", ["lq", "target"])
+def test_it_is_evaluated_from_the_start_box_of_its_own_preset(preset, task):
+    _, _, box = SPECIFIED[preset, "target"]
+    found = env_of(preset, task).evaluation_states()
+    assert found.shape == (17, 4) and found[0].tolist() == [-4.0, 0.0, 0.0, 0.0]
+    offsets = np.abs(found[1:] - found[0])
+    assert np.allclose(offsets, 0.5 * np.array(box), atol=1e-15)

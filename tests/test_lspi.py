@@ -67,7 +67,7 @@ def test_the_riccati_gain_is_a_fixed_point_of_policy_iteration():
     ab = np.hstack([a, b])
     matrix = -ab.T @ (COST + LQ.gamma * value) @ ab
     matrix[4:, 4:] -= 0.1 * np.eye(2)
-    assert np.allclose(improved(matrix, 4), k, atol=1e-10)
+    assert np.allclose(improved(matrix, LQ), k, atol=1e-10)
 
 
 def test_no_gain_near_riccatis_earns_more():
@@ -197,7 +197,7 @@ def good_matrix():
 
 
 def test_the_improved_gain_by_hand():
-    assert improved(good_matrix(), 4).tolist() == [[-2, -1, 0, 0], [0, 0, -2, -1]]
+    assert improved(good_matrix(), LQ).tolist() == [[-2, -1, 0, 0], [0, 0, -2, -1]]
 
 
 @pytest.mark.parametrize(
@@ -214,7 +214,7 @@ def test_the_improved_gain_by_hand():
 def test_a_gain_that_pushes_away_or_is_none_is_refused(where, value):
     matrix = good_matrix()
     matrix[where] = value
-    assert improved(matrix, 4) is None
+    assert improved(matrix, LQ) is None
 
 
 @pytest.mark.parametrize("returned", [None, -1e5])
@@ -224,10 +224,10 @@ def test_a_seed_that_fails_is_named_and_the_others_are_as_without_it(
     """Seed 1 of three finds no gain in iteration 2, or one that explodes later."""
     expected, calls = moments(), []
 
-    def faulty(matrix, d):
-        calls.append(d)
+    def faulty(matrix, env):
+        calls.append(env)
         if len(calls) != 3 + 2:
-            return improved(matrix, d)
+            return improved(matrix, env)
         return returned if returned is None else np.full((2, 4), returned)
 
     monkeypatch.setattr(lspi, "improved", faulty)

@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bcrl import probes
 from bcrl.envs.car_on_hill import CarOnHill
 from bcrl.envs.maze import Maze
-from bcrl.errors import BcrlError
-from bcrl.oracle import cache, maze, reference
+from bcrl.errors import BcrlError, ConfigError
+from bcrl.oracle import available, cache, maze, oracles, reference
 from bcrl.oracle import car_on_hill as oracle
 from bcrl.oracle.__main__ import main
 from bcrl.oracle.cover import FAR, cover, image_boxes
+from tests.toys import Corridor
 
 MASSES = (0.8, 1.0, 1.2)
 PUBLISHED = Path(__file__).parent / "data" / "car_on_hill_qstar_mass_1.0.csv"
@@ -298,3 +300,25 @@ def test_a_closed_pipe_is_no_error() -> None:
     assert done.returncode == 141
     assert b"Traceback" not in done.stderr
     assert b"Error" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    "name", ["cache", "cover", "riccati", "__main__", "__init__", "a.b", "", "maze"]
+)
+def test_only_an_oracle_of_an_environment_counts_as_its_oracle(name: str) -> None:
+    class Other(Corridor):
+        pass
+
+    Other.name = name
+    env = Other()
+    assert not available(env) and reference(env) is None
+    with pytest.raises(ConfigError, match=r"env\.metrics=q_error"):
+        probes.check(["q_error"], env)
+    assert sorted(oracles()) == ["car_on_hill", "maze"]
+
+
+def test_a_kind_of_maze_with_other_rewards_has_no_oracle() -> None:
+    class Richer(Maze):
+        pass
+
+    assert available(Maze()) and not available(Richer())

@@ -86,6 +86,20 @@ def test_a_model_is_stored_as_its_problem_and_fitted_again(tmp_path, kind):
     assert (tmp_path / "packed.npz").stat().st_size < 10_000
 
 
+def test_a_class_of_the_users_does_not_replace_ours_of_the_same_name(tmp_path):
+    ours = Sum((ZERO,))
+
+    @pack.storable
+    @dataclass
+    class Mine:
+        terms: tuple
+
+    Mine.__name__ = "Sum"
+    found = there_and_back(tmp_path, [ours, Mine((1, 2))], [ZERO])
+    assert type(found[0]) is Sum and found[0] == ours
+    assert type(found[1]) is Mine and found[1].terms == (1, 2)
+
+
 def test_what_is_not_storable_is_refused(tmp_path):
     @dataclass
     class Sum:  # of the same name as ours
@@ -106,8 +120,8 @@ def forged(path, structure, data=b""):
     "structure",
     [
         ["object", "os.system", {"command": "true"}],
-        ["object", "Sum", {"terms": ["list", []], "more": 1}],
-        ["object", "Sum"],
+        ["object", "bcrl.q.Sum", {"terms": ["list", []], "more": 1}],
+        ["object", "bcrl.q.Sum"],
         ["array", [0, "|O", [1], "C"]],
         ["array", [0, "<f8", [1000], "C"]],
         ["array", [-8, "<f8", [1], "C"]],

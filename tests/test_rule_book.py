@@ -116,11 +116,8 @@ def dqn(section, curriculum, tasks, transfers):
             quadratic = getattr(tasks[task], "linear_quadratic", None) is not None
             kind = "lspi" if quadratic and transfers and slot == 0 else "dqn"
         if kind == "lspi":
-            horizon = tasks[task].horizon
-            episodes = max(values["steps"][slot] // (own["iterations"] * horizon), 1)
-            tested = values["evaluation_episodes"][slot]
-            made.append(LSPI(episodes=episodes, evaluation_episodes=tested, **own))
-            made[-1] = replace(made[-1], horizon=horizon)
+            steps, tested = (values[k][slot] for k in ("steps", "evaluation_episodes"))
+            made.append(LSPI(steps=steps, evaluation_episodes=tested, **own))
         else:
             left_out = ("name", "learners", "lspi", "hidden")
             each = {k: v[slot] for k, v in values.items() if k not in left_out}
@@ -273,7 +270,7 @@ REFUSED = {
     "LSPI without a network": (LINEAR, [LSPI(), DEEP], (), "learners"),
     "LSPI twice": (REUSED, LSPI(), (B,), "learners"),
     "LSPI last": (LINEAR[::-1], [DEEP, LSPI()], (SHAPE,), "learners"),
-    "LSPI's horizon": (LINEAR, [LSPI(horizon=50), DEEP], (B,), "lspi.horizon"),
+    "LSPI's steps": (LINEAR, [LSPI(steps=2100), DEEP], (B,), "steps"),
     "LSPI's features": (LINEAR, [LSPI(features="cubic"), DEEP], (B,), "lspi.features"),
     "LSPI's noise": (LINEAR, [LSPI(noise_std=0.0), DEEP], (B,), "lspi.noise_std"),
 }

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
 
+from bcrl.pack import storable
 from bcrl.stage import Stage, Team
 
 
@@ -64,3 +65,56 @@ def last(moments):
     """The last of what a learner yields, evaluating none."""
     *_, moment = moments
     return moment
+
+
+@dataclass(frozen=True)
+class Simulated(OpenCorridor):
+    """The corridor as a simulator; episodes reset by a `doomed` number fail early."""
+
+    doomed: tuple[float, ...] = ()
+    starts: int = 4
+
+    def initial(self, noise):
+        return noise  # what resets a lane, no state
+
+    def evaluation_states(self):
+        return self.lanes().begin((np.arange(self.starts)[:, None] + 0.5) / self.starts)
+
+    def lanes(self):
+        return SimulatedLanes(self)
+
+    def check_tasks(self, tasks):
+        pass
+
+
+@storable
+@dataclass(eq=False)
+class SimulatedLanes:
+    """Lanes of `Simulated`, as `bcrl.envs.base.Lanes` says."""
+
+    env: Simulated
+    number: np.ndarray | None = None  # (…) what each lane was reset by
+    steps: np.ndarray | None = None  # (…)
+    failures: dict[int, str] = field(default_factory=dict)
+
+    def begin(self, start):
+        self.number, self.steps = start[..., 0].copy(), np.zeros(start.shape[:-1], int)
+        return np.floor(start * 5)
+
+    def step(self, state, action, noise, lanes=...):
+        after, reward, absorbing = self.env.step(state, action)
+        self.steps[lanes] += 1
+        places = np.arange(self.steps.size).reshape(self.steps.shape)[lanes]
+        fails = np.isin(self.number, self.env.doomed) & (self.steps >= 1)
+        fails[lanes] |= np.isin(places, list(self.failures))
+        for place in places[fails[lanes]].tolist():
+            self.failures.setdefault(place, "step failed: it broke")
+        lost = fails[lanes]
+        after[lost], reward[lost], absorbing[lost] = 0.0, 0.0, False
+        return after, reward, absorbing, lost
+
+    def restart(self, over, start, state):
+        places = np.arange(self.steps.size).reshape(self.steps.shape)
+        again = over & ~np.isin(places, list(self.failures))
+        self.number[again], self.steps[again] = start[..., 0][again], 0
+        return np.where(again[..., None], np.floor(start * 5), state)

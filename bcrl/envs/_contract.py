@@ -130,7 +130,8 @@ class Simulator:
             self._check_members(method, self.space, seen)
             vector = spaces.flatten(self.space, seen)
             text = f"observations, {_short(self.space)}, are flattened to "
-            self.adapted[f"{text}{len(vector)} numbers"] = None
+            text += f"{len(vector)} numbers, as FlattenObservation does"
+            self.adapted[text] = None
         expected = self.task.__dict__.get("state_dim", len(vector))
         if len(vector) != expected:
             why = f"{expected}, as many as after the first reset"
@@ -229,8 +230,9 @@ def _line(error: BaseException) -> str:
 def _place(error: BaseException) -> str:
     """Where in foreign code an error arose, as `…/file.py:12`."""
     frames = traceback.extract_tb(error.__traceback__)
-    foreign = [f for f in frames if not {*OURS} & {*Path(f.filename).parents}]
-    frame = (foreign or frames)[-1]
+    files = [f for f in frames if not f.filename.startswith("<")]
+    foreign = [f for f in files if not {*OURS} & {*Path(f.filename).parents}]
+    frame = (foreign or files)[-1]
     return f"…/{Path(frame.filename).name}:{frame.lineno}"
 
 

@@ -49,6 +49,8 @@ class Env(Protocol):
 class ContinuousEnv(Env, Protocol):
     """An env that takes any vector as its action; LSPI learns in its LQ tasks."""
 
+    positions: ClassVar[tuple[int, ...]]  # which entry of the state each force moves
+
     @property
     def linear_quadratic(self) -> tuple[NDArray[np.float64], ...] | None:
         """A, B, Q, R of s' = A s + B a, reward −s'ᵀ Q s' − aᵀ R a; None if not so."""
@@ -75,12 +77,11 @@ class FiniteEnv(Env, Protocol):
 
 
 class Lanes(Protocol):
-    """Episodes of one env side by side, one per lane, in arrays of any leading axes.
+    """Episodes of one env side by side, one per lane, in arrays of any leading axes."""
 
-    A lane that fails gives states and rewards of 0 and is always cut.
-    """
-
-    failures: dict[int, str]  # lane, counted in C order → why it failed
+    #: Lanes whose simulator failed, counted in C order, and why. Such a lane gives
+    #: zeros and is cut at every step; the others don't notice.
+    failures: dict[int, str]
 
     def begin(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
         """The states (…, d) of lanes that start as `initial` says."""
@@ -128,7 +129,6 @@ class PureLanes:
     """Lanes of an env whose steps are pure functions: the caller has the states."""
 
     env: Env
-
     failures: ClassVar[dict[int, str]] = {}
 
     def begin(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -142,8 +142,8 @@ class PureLanes:
         noise: NDArray[np.float64],
         lanes: Any = ...,
     ) -> tuple[NDArray, NDArray, NDArray, NDArray | bool]:
-        """`step`, or `push` if the actions are forces; never cut."""
-        step = self.env.push if action.dtype == np.float64 else self.env.step
+        """`step` for actions (…), `push` for forces (…, k); never cut."""
+        step = self.env.push if action.ndim == state.ndim else self.env.step
         return *step(state, action, noise), False
 
     def restart(

@@ -76,6 +76,7 @@ class LinearSystem:
     initial_noise: ClassVar[int] = 4
     step_noise: ClassVar[int] = 8  # four for the derivative, four for a fresh start
     actions: ClassVar[NDArray[np.float64]] = ACTIONS
+    positions: ClassVar[tuple[int, ...]] = (0, 2)
 
     def __post_init__(self) -> None:
         for key, allowed in (("task", ("lq", "target")), ("preset", tuple(PRESETS))):
@@ -194,7 +195,7 @@ class LinearSystem:
 
         The same in both tasks, so that FQI's curves go on from one to the other.
         """
-        half = 0.5 * np.array(PRESETS["released"]["target"].spread)
+        half = 0.5 * np.array(PRESETS[self.preset]["target"].spread)
         signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 4, indexing="ij"), -1)
         return np.array(START) + half * np.vstack(
             [np.zeros((1, 4)), signs.reshape(-1, 4)]

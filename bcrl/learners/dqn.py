@@ -6,8 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from threadpoolctl import threadpool_limits
-
 from bcrl.learners.lockstep import Lockstep
 from bcrl.policies import annealed
 from bcrl.stage import Pause, Stage, Team
@@ -67,13 +65,12 @@ class DQN:
         There is a moment to see before the first that isn't random, after every
         `evaluate_every` and after the last.
         """
-        with threadpool_limits(1):  # what there is for BLAS is too little for more
-            run = Lockstep(self, stage, start, team, state)
-            if state is None:
-                yield run.pause()
-            while run.step < self.length:
-                run.act()
-                if run.replay.size > self.learning_starts:
-                    run.update()
-                run.end_step()
-                yield run.pause()
+        run = Lockstep(self, stage, start, team, state)
+        if state is None:
+            yield run.pause()
+        while run.step < self.length:
+            run.act()
+            if run.replay.size > self.learning_starts:
+                run.update()
+            run.end_step()
+            yield run.pause()

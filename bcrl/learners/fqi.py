@@ -12,8 +12,8 @@ import numpy as np
 from bcrl import data, rollout
 from bcrl.bellman import residual_target, shaping
 from bcrl.envs import is_finite, is_simulated
-from bcrl.q import ZERO, Table, Values
-from bcrl.q.regression import Fits, Fitted, Problem, Regressor
+from bcrl.q import NOT_FINITE, ZERO, Table, Values, ask
+from bcrl.q.regression import Fits, Fitted, Problem, Regressor, fit_each
 from bcrl.stage import Snapshot, Stage, Team
 from bcrl.streams import stream
 from bcrl.transfer import Learned, Start
@@ -56,12 +56,16 @@ class FQI:
         self, stage: Stage, start: Start, team: Team, state: Any = None
     ) -> Iterator[Iteration]:
         """Learn a stage, ϱ ← S(T(base + ϱ) − base); yields after each iteration."""
-        done, sets, residual = state or (0, self._data(stage, start, team), None)
+        done, sets, residual, failed = state or (0, *self._data(stage, start, team))
         env, points = stage.env, [d.points for d in sets]
-        base = start.base(points, env.n_actions)
+        base, lost = ask(start.base, points, env.n_actions)
+        failed = lost | failed
         if residual is None:
-            residual = start.initial(points, env.n_actions)
-        lift = [v.max(-1) for v in start.potential(points, env.n_actions)]
+            residual, lost = ask(start.initial, points, env.n_actions)
+            failed = lost | failed
+        potential, lost = ask(start.potential, points, env.n_actions)
+        failed = lost | failed
+        lift = [v.max(-1) for v in potential]
         rewards = [
             d.reward + shaping(v[d.state], v[d.next_state], d.absorbing, env.gamma)
             for d, v in zip(sets, lift, strict=True)
@@ -78,16 +82,23 @@ class FQI:
         for k in range(done + 1, self.iterations + 1):
             residual = [values.copy() for values in residual]
             problems = self._problems(stage, k, team, rewards, sets, base, residual)
+            # A seed that failed keeps its last good ϱ; nobody learns from it any more.
+            problems = {
+                cell: p for cell, p in problems.items() if cell[0] not in failed
+            }
             keep = not is_finite(env)  # a table is never asked between its points
-            fits = self.regressor.fit(list(problems.values()), keep, team.threads)
-            for ((s, a), problem), fit in zip(problems.items(), fits, strict=True):
-                part = sets[s].by_action[a]
+            fits, lost = fit_each(self.regressor, problems, keep, team.threads)
+            failed = lost | failed
+            for (s, a), fit in fits.items():
+                part, problem = sets[s].by_action[a], problems[s, a]
                 residual[s][sets[s].state[part.rows], a] = fit.fitted
                 residual[s][part.query_points, a] = fit.queried
                 models[s][a] = Fitted.of(problem, fit)
             q = [b + r for b, r in zip(base, residual, strict=True)]
             if start.shape is not None:
                 q = [x + v[:, None] for x, v in zip(q, lift, strict=True)]
+            lost = {s for s, x in enumerate(q) if not np.isfinite(x).all()}
+            failed = dict.fromkeys(lost, NOT_FINITE) | failed
             if is_finite(env):
                 learned = Learned(Table(q, env), Table(residual, env), sets)
             else:
@@ -97,18 +108,21 @@ class FQI:
             yield Iteration(
                 stage,
                 stage.before + k,
-                functools.partial(_state, k, sets, residual),
+                functools.partial(_state, k, sets, residual, failed),
                 k == self.iterations,
                 learned,
                 [values[d.probe] for values, d in zip(q, sets, strict=True)],
                 [values[d.probe] for values, d in zip(residual, sets, strict=True)],
+                failed=failed,
             )
 
-    def _data(self, stage: Stage, start: Start, team: Team) -> list[data.Dataset]:
-        """Each seed's dataset of ε-greedy episodes in the stage's task."""
+    def _data(
+        self, stage: Stage, start: Start, team: Team
+    ) -> tuple[list[data.Dataset], None, dict[int, str]]:
+        """Each seed's dataset of ε-greedy episodes, no ϱ yet, which seeds failed."""
         previous = start.previous
         if not self.new_data and previous is not None:
-            return previous.data
+            return previous.data, None, {}
         if self.shared_data:
             rngs = [stream(0, "shared_data", stage.task)]
         else:
@@ -119,7 +133,14 @@ class FQI:
         q = ZERO if previous is None else previous.q
         played = rollout.rollout(env, q, begin, u, self.epsilon)
         sets = [data.build(env, played, s, team.probe) for s in range(len(rngs))]
-        return sets * len(team.seeds) if self.shared_data else sets
+        if not self.shared_data:
+            return sets, None, played.failed
+        n = len(team.seeds)
+        return (
+            sets * n,
+            None,
+            {s: why for s in range(n) for why in played.failed.values()},
+        )
 
     def _problems(
         self,
@@ -156,6 +177,8 @@ class FQI:
         return problems
 
 
-def _state(k: int, sets: list[data.Dataset], residual: Values) -> tuple:
+def _state(
+    k: int, sets: list[data.Dataset], residual: Values, failed: dict[int, str]
+) -> tuple:
     """What FQI needs to go on after iteration k: no model, the next fits anew."""
-    return k, sets, residual
+    return k, sets, residual, failed

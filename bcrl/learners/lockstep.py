@@ -240,6 +240,7 @@ class Lockstep:
         failed = {int(s): "non-finite weights" for s in np.flatnonzero(lost)}
         for s in np.flatnonzero(~np.isfinite(self.loss)):
             failed.setdefault(int(s), "non-finite loss")
+        failed |= self.lanes.failures  # one lane per seed
         loss = self.loss / self.updates if self.updates else self.loss + np.nan
         self.loss, self.updates = np.zeros_like(loss), 0
         return Moment(
@@ -251,7 +252,7 @@ class Lockstep:
             self._policy(),
             self.settings.evaluation_episodes,
             loss,
-            failed,
+            failed=failed,
         )
 
     def _policy(self) -> Policy:

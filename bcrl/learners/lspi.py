@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.arrays import ndtri
+from bcrl.envs.base import ContinuousEnv, Env
+from bcrl.errors import ConfigError
 from bcrl.q import ZERO, Q
 from bcrl.q.quadratic import Quadratic, features
 from bcrl.rollout import Policy, play, start_states
@@ -22,26 +24,35 @@ from bcrl.transfer import Learned, Start
 class LSPI:
     """Policy iteration on a = K s + noise, K = 0 at first (paper, C.3).
 
-    Each iteration collects `episodes` with the current gain, solves LSTDQ on them alone
-    and sets K ← −Quu⁻¹ Qus. `features`: see `bcrl.q.quadratic`. `drop_last` leaves each
-    episode's last step out [released]. A gain that is not finite, or pushes away from
-    the goal (K[0, 0] or K[1, 2] above 0), fails its seed.
+    Each iteration collects its share of the `steps` in whole episodes with the current
+    gain, solves LSTDQ on them alone and sets K ← −Quu⁻¹ Qus. `features`: see
+    `bcrl.q.quadratic`. `drop_last` leaves each episode's last step out [released]. A
+    gain that is not finite, or pushes away from the goal (a force grows with its
+    position), fails its seed.
     """
 
     iterations: int = 4
-    episodes: int = 5
+    steps: int = 2000  # environment steps of a stage
     noise_std: float = 0.1
     features: str = "products"
     drop_last: bool = True
     evaluation_episodes: int = 50
-    horizon: int = 100  # of the task
 
     name: ClassVar[str] = "lspi"
 
     @property
     def length(self) -> int:
         """Environment steps of a stage."""
-        return self.iterations * self.episodes * self.horizon
+        return self.steps
+
+    def episodes(self, env: Env) -> int:
+        """Episodes per iteration; ConfigError unless `steps` are whole ones."""
+        whole, rest = divmod(self.steps, self.iterations * env.horizon)
+        if rest or not whole:
+            why = f"LSPI needs a multiple of {self.iterations} iterations"
+            why += f" x {env.horizon} steps"
+            raise ConfigError("algorithm.steps", self.steps, why)
+        return whole
 
     def learn(
         self, stage: Stage, start: Start, team: Team, state: Any = None
@@ -65,7 +76,7 @@ class LSPI:
                     np.stack(theta), self.features, m, env.actions
                 )
                 for s in range(n):
-                    found = improved(q.matrix[s], env.state_dim)
+                    found = improved(q.matrix[s], env)
                     if found is None:
                         why = f"LSPI found no stabilising gain in iteration {iteration}"
                         failed.setdefault(s, why)
@@ -86,17 +97,17 @@ class LSPI:
             policy,
             self.evaluation_episodes,
             np.full(len(gain), np.nan),
-            failed,
+            failed=failed,
         )
 
     def _collect(
         self, stage: Stage, gain: NDArray, iteration: int, team: Team
     ) -> tuple[NDArray, NDArray, NDArray]:
         """Each seed's (s, a) (S, n, m), next (s', K s') and rewards (S, n)."""
-        env, k = stage.env, gain.shape[1]
+        env, k, episodes = stage.env, gain.shape[1], self.episodes(stage.env)
         rngs = [stream(x, "data", stage.number, iteration) for x in team.seeds]
-        begin = np.stack([start_states(rng, env, self.episodes) for rng in rngs])
-        shape = (env.horizon, self.episodes, k + env.step_noise)
+        begin = np.stack([start_states(rng, env, episodes) for rng in rngs])
+        shape = (env.horizon, episodes, k + env.step_noise)
         u = np.stack([rng.random(shape) for rng in rngs])
         played = play(env, _linear(gain, self.noise_std), begin, u)
         cut = env.horizon - 1 if self.drop_last else env.horizon
@@ -144,14 +155,17 @@ def _linear(gain: NDArray, noise_std: float = 0.0) -> Policy:
     return act
 
 
-def improved(matrix: NDArray[np.float64], d: int) -> NDArray[np.float64] | None:
+def improved(
+    matrix: NDArray[np.float64], env: ContinuousEnv
+) -> NDArray[np.float64] | None:
     """K (k, d) = −Quu⁻¹ Qus of Q = zᵀ `matrix` z; None if no K pulls to the goal.
 
-    With states (x, ẋ, y, ẏ, …) force i must not grow with position i.
+    Force i must not grow with the position that it moves, `env.positions[i]`.
     """
+    d = env.state_dim
     try:
         gain = -np.linalg.solve(matrix[d:, d:], matrix[d:, :d])
     except np.linalg.LinAlgError:
         return None
-    own = [gain[i, 2 * i] for i in range(len(gain))]
-    return gain if np.isfinite(gain).all() and max(own) <= 0.0 else None
+    own = gain[range(len(gain)), env.positions]
+    return gain if np.isfinite(gain).all() and own.max() <= 0.0 else None

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 import importlib
-import importlib.util
+import pkgutil
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +26,33 @@ class Reference:
         self.q.setflags(write=False)
 
 
+@functools.cache
+def oracles() -> dict[str, ModuleType]:
+    """Modules of this package that know a Q*, by name.
+
+    Such a module says by `ENV` of which environment, and has `reference` and `table`.
+    """
+    found = (
+        (module.name, importlib.import_module(f"{__name__}.{module.name}"))
+        for module in pkgutil.iter_modules(__path__)
+        if not module.name.startswith("_")
+    )
+    return {name: module for name, module in found if hasattr(module, "ENV")}
+
+
+def _of(env: Env) -> ModuleType | None:
+    """The oracle of `env`, not of whatever else has its name."""
+    found = (module for module in oracles().values() if type(env) is module.ENV)
+    return next(found, None)
+
+
 def available(env: Env) -> bool:
-    """Whether an oracle module is named as `env` is."""
-    return importlib.util.find_spec(f"{__name__}.{env.name}") is not None
+    """Whether an oracle knows `env`."""
+    return _of(env) is not None
 
 
 @functools.lru_cache(maxsize=64)
 def reference(env: Env) -> Reference | None:
-    """Q* of `env` by the oracle module named as it is, or None if there is none."""
-    if not available(env):
-        return None
-    return importlib.import_module(f"{__name__}.{env.name}").reference(env)
+    """Q* of `env` by the oracle that knows it, or None if there is none."""
+    oracle = _of(env)
+    return oracle.reference(env) if oracle else None

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import importlib
 import os
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from bcrl.envs import env_class, is_finite
+from bcrl.envs import is_finite
 from bcrl.errors import BcrlError, did_you_mean
+from bcrl.oracle import oracles
 
-ORACLES = ("car_on_hill", "maze")
 PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
 
 
@@ -28,8 +27,8 @@ def parser() -> Parser:
     """A sub-command for each env with an oracle, an option for each of its fields."""
     top = Parser(prog="python -m bcrl.oracle", description=__doc__, allow_abbrev=False)
     commands = top.add_subparsers(dest="env", required=True, metavar="ENV")
-    for name in ORACLES:
-        kind = env_class(name)
+    for name, oracle in oracles().items():
+        kind = oracle.ENV
         sub = commands.add_parser(name, allow_abbrev=False, help=f"Q* of {name}")
         for field in dataclasses.fields(kind):
             if field.name != "horizon":  # Q* has none
@@ -45,16 +44,15 @@ def parser() -> Parser:
 def run(arguments: Sequence[str]) -> None:
     """Print the table of the env that `arguments` name; BcrlError if it has none."""
     top = parser()
-    if arguments and arguments[0][:1] != "-" and arguments[0] not in ORACLES:
+    if arguments and arguments[0][:1] != "-" and arguments[0] not in oracles():
         raise BcrlError(
-            f"no oracle {arguments[0]}: {did_you_mean(arguments[0], ORACLES)}"
+            f"no oracle {arguments[0]}: {did_you_mean(arguments[0], oracles())}"
         )
     chosen = vars(top.parse_args(arguments))
-    name = chosen.pop("env")
-    env = env_class(name)(**chosen)
+    oracle = oracles()[chosen.pop("env")]
+    env = oracle.ENV(**chosen)
     if not getattr(env, "finite", True):
         raise BcrlError(f"{env}: its states are not finitely many, so it has no table")
-    oracle = importlib.import_module(f"bcrl.oracle.{name}")
     for line in oracle.table(env):
         print(line)
     sys.stdout.flush()

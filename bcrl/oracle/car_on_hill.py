@@ -23,6 +23,7 @@ from bcrl.oracle import Reference, cache
 from bcrl.oracle import cover as covers
 from bcrl.oracle.cover import FAR, Cover, cover
 
+ENV = CarOnHill
 #: Cells along each axis; the finer cover is for where the coarser prunes too little.
 COVERS = (500, 2000)
 BUDGET = 20_000_000  # steps driven with one cover: about 20 s and 1 GiB

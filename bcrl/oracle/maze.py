@@ -12,6 +12,8 @@ from bcrl.envs.base import FiniteEnv
 from bcrl.envs.maze import Maze
 from bcrl.oracle import Reference
 
+ENV = Maze
+
 
 def optimal_q(
     next_index: NDArray[np.integer],

@@ -9,10 +9,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.envs import Env
+from bcrl.envs import Env, FiniteEnv
+from bcrl.errors import BcrlError, SeedsFailed
 from bcrl.pack import storable
 
 Values = Sequence[NDArray[np.float64]]
+NOT_FINITE = "Q is not finite"  # why a seed failed
 
 
 class Q(Protocol):
@@ -29,6 +31,51 @@ def each(states: Sequence[NDArray], values: Callable[[int], NDArray]) -> Values:
     """`values(s)` for every seed, stacked if the states are."""
     found = [values(s) for s in range(len(states))]
     return np.stack(found) if isinstance(states, np.ndarray) else found
+
+
+def check_width(states: Sequence[NDArray], d: int) -> None:
+    """Raise BcrlError unless all states have the `d` entries that a Q was learned on.
+
+    Compiled code would read what lies beside a shorter state.
+    """
+    stacked = isinstance(states, np.ndarray)
+    for width in {x.shape[-1] for x in ((states,) if stacked else states)}:
+        if width != d:
+            why = "a simulator's observations are its states, not what resets it"
+            raise BcrlError(f"Q of states with {d} entries asked at {width}: {why}")
+
+
+def rows_of(env: FiniteEnv, state: NDArray[np.float64]) -> NDArray[np.intp]:
+    """The row of each state (..., d) in `env.states()`; BcrlError if there is none."""
+    row = np.asarray(env.index(state))
+    if row.size and not 0 <= row.min() <= row.max() < len(env.states()):
+        raise BcrlError(f"{env}: index gives rows that states() doesn't have")
+    return row
+
+
+def ask(
+    q: Q, states: Sequence[NDArray[np.float64]], n_actions: int
+) -> tuple[list[NDArray[np.float64]], dict[int, str]]:
+    """Values (n_s, A) of S seeds, and by place why a seed's can't be used.
+
+    A seed whose Q can't be asked gets zeros; the others' values don't depend on it.
+    """
+    failed: dict[int, str] = {}
+    while True:
+        asked = [x[:0] if s in failed else x for s, x in enumerate(states)]
+        try:
+            values = list(q(asked, n_actions))
+            break
+        except SeedsFailed as error:
+            if error.reasons.keys() <= failed.keys():
+                raise
+            failed |= error.reasons
+    for s, x in enumerate(states):
+        if s in failed:
+            values[s] = np.zeros((len(x), n_actions))
+        elif not np.isfinite(values[s]).all():
+            failed[s] = NOT_FINITE
+    return values, failed
 
 
 class Zero:
@@ -129,4 +176,5 @@ class Table:
     env: Env
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        return each(states, lambda s: self.values[s][self.env.index(states[s])])
+        check_width(states, self.env.state_dim)
+        return each(states, lambda s: self.values[s][rows_of(self.env, states[s])])

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from bcrl.pack import DERIVED, storable
-from bcrl.q import Values, compiled, each
+from bcrl.q import Values, check_width, compiled, each
 from bcrl.q.tiles import FADED
 
 Tensor = torch.Tensor
@@ -161,6 +161,7 @@ class DeepQ:
     steps: int = 0  # environment steps since the networks were new
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        check_width(states, self.online.sizes[0])
         if isinstance(states, np.ndarray):
             return self._values(self.online, states)
         return each(states, lambda s: self._one(s, states[s]))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bcrl.arrays import per_lane
 from bcrl.pack import storable
-from bcrl.q import Values
+from bcrl.q import Values, check_width
 
 #: products: all z_i z_j, i ≤ j [released]; linear_quadratic: the z_i besides [paper].
 FEATURES = ("products", "linear_quadratic")
@@ -57,6 +57,7 @@ class Quadratic:
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         parts = self._parts
+        check_width(states, len(parts[0][0]))
         if isinstance(states, np.ndarray):
             return _values(states, *parts)
         return [_values(x, *(part[s] for part in parts)) for s, x in enumerate(states)]

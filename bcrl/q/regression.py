@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import textwrap
+import traceback
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.errors import BcrlError, SeedsFailed
 from bcrl.pack import DERIVED, storable
 from bcrl.q import Values
 from bcrl.streams import stream
@@ -77,6 +80,68 @@ class Fitted:
         return cls(replace(problem, queries=problem.queries[:0]), fit.model)
 
 
+Cell = tuple[int, int]  # seed, by place in its team, and action
+
+
+def fit_each(
+    regressor: Regressor, problems: Mapping[Cell, Problem], keep: bool, threads: int
+) -> tuple[dict[Cell, Fit], dict[int, str]]:
+    """Fits of `problems`, and why seeds have none; those of the others are the same."""
+
+    def fit(cells: list[Cell]) -> list[Fit]:
+        asked = [problems[cell] for cell in cells]
+        fits = regressor.fit(asked, keep, threads)
+        for problem, found in zip(asked, fits, strict=True):
+            for values, x in (
+                (found.fitted, problem.x),
+                (found.queried, problem.queries),
+            ):
+                _check_shape(values, len(x))
+                if not np.isfinite(values).all():
+                    raise BcrlError("gave a prediction that is not finite")
+        return fits
+
+    return _by_seed(regressor, "fit", fit, list(problems))
+
+
+def _by_seed(
+    regressor: Regressor, what: str, do: Callable[[list[Cell]], list], cells: list[Cell]
+) -> tuple[dict[Cell, Any], dict[int, str]]:
+    """What `do(cells)` gives; where it raises, seed by seed, and why seeds failed."""
+    try:
+        return dict(zip(cells, do(cells), strict=True)), {}
+    except Exception as error:  # whatever a regressor of the user's does
+        seeds = dict.fromkeys(s for s, _ in cells)
+        if len(seeds) == 1:
+            return {}, dict.fromkeys(seeds, _reason(regressor, what, error))
+    found, failed = {}, {}
+    for seed in seeds:
+        own = [cell for cell in cells if cell[0] == seed]
+        some, lost = _by_seed(regressor, what, do, own)
+        found, failed = found | some, failed | lost
+    return found, failed
+
+
+def _check_shape(values: Any, n: int) -> None:
+    """Raise BcrlError unless there are n predictions."""
+    if np.shape(values) != (n,):
+        text = f"gave predictions of shape {np.shape(values)}, expected ({n},)"
+        raise BcrlError(text)
+
+
+def _reason(regressor: Regressor, what: str, error: Exception) -> str:
+    """Which regressor failed, how, and where in the code unless we said so."""
+    text = " ".join(str(error).split())
+    if not isinstance(error, BcrlError):
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"({place.filename}:{place.lineno})"
+        kind = type(error).__name__
+        kind = "out of memory" if isinstance(error, MemoryError) else kind
+        text = f"{kind}: {text} {where}"
+    name = textwrap.shorten(repr(regressor), 200)
+    return f"algorithm.regressor={name}: {what} failed: {text}"
+
+
 class Threads(Protocol):
     """Whoever says how many threads predictions may take."""
 
@@ -100,13 +165,20 @@ class Fits:
             for a, fitted in enumerate(row)
             if fitted is not None and len(states[s])
         ]
+
+        def predict(cells: list[Cell]) -> list[NDArray[np.float64]]:
+            models = [self.models[s][a].model for s, a in cells]
+            asked = [states[s] for s, _ in cells]
+            found = self.regressor.predict(models, asked, self.team.threads)
+            for x, values in zip(asked, found, strict=True):
+                _check_shape(values, len(x))
+            return found
+
+        found, failed = _by_seed(self.regressor, "predict", predict, cells)
+        if failed:
+            raise SeedsFailed(failed)
         out = [np.zeros((len(x), n_actions)) for x in states]
-        found = self.regressor.predict(
-            [self.models[s][a].model for s, a in cells],
-            [states[s] for s, _ in cells],
-            self.team.threads,
-        )
-        for (s, a), values in zip(cells, found, strict=True):
+        for (s, a), values in found.items():
             out[s][:, a] = values
         return np.stack(out) if isinstance(states, np.ndarray) else out
 

@@ -63,6 +63,7 @@ class Tabular:
 
     def _fit_one(self, problem: Problem) -> Fit:
         _, cell = np.unique(problem.x, axis=0, return_inverse=True)
+        cell = cell.reshape(-1)  # NumPy 2.0 gives (n, 1)
         weight = np.bincount(cell, problem.multiplicity)
         mean = np.bincount(cell, problem.multiplicity * problem.y) / weight
         return Fit(None, mean[cell], np.zeros(len(problem.queries)))
