@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
 from numbers import Integral, Real
 from typing import TypeVar
@@ -183,14 +183,11 @@ def _check_lspi(chosen: Composition, slot: int, learner: LSPI, start: Start) -> 
 
 
 def _check_numbers(section: str, learner: FQI | DQN | LSPI) -> None:
-    for name, (kind, least, *most) in BOUNDS.items():
-        value = getattr(learner, name, least)
-        number = isinstance(value, Integral if kind is int else Real)
-        if (
-            not number
-            or isinstance(value, bool)
-            or not least <= value <= max(most, default=math.inf)
-        ):
+    for name in (f.name for f in fields(learner) if f.name in BOUNDS):
+        (kind, least, *most), value = BOUNDS[name], getattr(learner, name)
+        fits = isinstance(value, Integral if kind is int else Real)
+        fits = fits and not isinstance(value, bool) and least <= value
+        if not fits or value > max(most, default=math.inf):
             noun = "an integer" if kind is int else "a number"
             bounds = f"from {least} to {most[0]}" if most else f"of at least {least}"
             raise ConfigError(f"{section}.{name}", value, f"must be {noun} {bounds}")
