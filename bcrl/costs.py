@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import resource
+
 from bcrl.compose import Plan
 from bcrl.envs import is_simulated
 
@@ -42,3 +45,24 @@ def expected(plan: Plan) -> float:
     if plan.variant in known:
         rate = known[plan.variant] / LENGTH[plan.env]
     return rate * plan.length
+
+
+def memory(plan: Plan) -> int:
+    """Bytes that the episodes or replays of seeds that train together may take."""
+    seeds, most = min(plan.lockstep, len(plan.seeds)), 0
+    for stage in plan.stages:
+        env, learner = stage.env, stage.learner
+        episodes = getattr(learner, "episodes", None)
+        if episodes is None:
+            episodes = 2 * learner.evaluation_episodes
+        states = 2 * 8 * episodes * (env.horizon + 1) * env.state_dim  # and a copy
+        row = 4 * (2 * env.state_dim + env.n_actions + 3)
+        most = max(most, seeds * (states + row * getattr(learner, "replay_size", 0)))
+    return most
+
+
+def available() -> int:
+    """Bytes of memory that this process may still take, as far as is known."""
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return there if limit == resource.RLIM_INFINITY else min(there, limit)

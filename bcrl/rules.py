@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
 from numbers import Integral, Real
 from typing import TypeVar
@@ -58,7 +58,7 @@ def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...
     slots = list(zip(chosen.order, learners, strict=True))
     last = learners[-1]
     warm = chosen.transfers == (warm_start,)
-    if warm and chosen.target_only and isinstance(last, DQN):
+    if warm and chosen.target_only and all(isinstance(x, DQN) for x in learners):
         steps = sum(learner.steps for learner in learners)
         slots = [(chosen.order[-1], replace(last, steps=steps))]
     made: list[Stage] = []
@@ -87,24 +87,6 @@ def capped(
     return _placed(made)
 
 
-def check_lspi(chosen: Composition, slot: int, named: object) -> None:
-    """Raise ConfigError, naming what was written, where LSPI can't learn a slot."""
-
-    def wrong(why: str) -> ConfigError:
-        return ConfigError("algorithm.learners", named, why)
-
-    env = chosen.slots[slot]
-    if getattr(env, "linear_quadratic", None) is None or not hasattr(env, "push"):
-        why = "learns quadratic Q-functions of continuous actions, but "
-        raise wrong(f"{why}{env} is no linear-quadratic task")
-    if (chosen.start or Start()).initial is not ZERO:
-        why = "leaves no network to start DQN's from: boosting=on or a transfer needed"
-        raise wrong(why)
-    if slot:
-        why = f"starts from nothing, so slot {slot + 1} would drop what the one before "
-        raise wrong(why + "has learned: LSPI in the first slot, DQN in the others")
-
-
 def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
     """Raise ConfigError for learners that don't suit the slots, or each other."""
     n, start = len(chosen.order), chosen.start or Start()
@@ -123,7 +105,7 @@ def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
         elif isinstance(learner, DQN):
             _check_dqn(chosen, learner, start)
         elif isinstance(learner, LSPI):
-            _check_lspi(chosen, slot, learner)
+            _check_lspi(chosen, slot, learner, start)
     for one, other in pairwise(learners):
         for name in PASSED_ON.get(type(other), ()) if start.initial is not ZERO else ():
             here, there = getattr(one, name, None), getattr(other, name)
@@ -179,25 +161,33 @@ def _check_dqn(chosen: Composition, learner: DQN, start: Start) -> None:
         raise chosen.refusal("transfer", chosen.transfer, why + "or `prior`")
 
 
-def _check_lspi(chosen: Composition, slot: int, learner: LSPI) -> None:
-    check_lspi(chosen, slot, learner)
+def _check_lspi(chosen: Composition, slot: int, learner: LSPI, start: Start) -> None:
+    env = chosen.slots[slot]
+    why = ""
+    if getattr(env, "linear_quadratic", None) is None or not hasattr(env, "push"):
+        why = "learns quadratic Q-functions of continuous actions, but "
+        why += f"{env} is no linear-quadratic task"
+    elif start.initial is not ZERO:
+        why = "leaves no network to start DQN's from: boosting=on or a transfer needed"
+    elif slot:
+        why = f"starts from nothing, so slot {slot + 1} would drop what the one before "
+        why += "has learned: LSPI in the first slot, DQN in the others"
+    if why:
+        raise ConfigError("algorithm.learners", learner.name, why)
     _check_numbers("algorithm.lspi", learner)
     one_of("algorithm.lspi.features", learner.features, FEATURES)
     if not 0 < learner.noise_std < math.inf:
         why = "must be above 0: without noise LSTDQ sees one action per state"
         raise ConfigError("algorithm.lspi.noise_std", learner.noise_std, why)
-    learner.episodes_per_iteration(chosen.slots[slot])  # raises
+    learner.episodes_per_iteration(env)  # says whether they are whole
 
 
 def _check_numbers(section: str, learner: FQI | DQN | LSPI) -> None:
-    for name, (kind, least, *most) in BOUNDS.items():
-        value = getattr(learner, name, least)
-        number = isinstance(value, Integral if kind is int else Real)
-        if (
-            not number
-            or isinstance(value, bool)
-            or not least <= value <= max(most, default=math.inf)
-        ):
+    for name in (f.name for f in fields(learner) if f.name in BOUNDS):
+        (kind, least, *most), value = BOUNDS[name], getattr(learner, name)
+        fits = isinstance(value, Integral if kind is int else Real)
+        fits = fits and not isinstance(value, bool) and least <= value
+        if not fits or value > max(most, default=math.inf):
             noun = "an integer" if kind is int else "a number"
             bounds = f"from {least} to {most[0]}" if most else f"of at least {least}"
             raise ConfigError(f"{section}.{name}", value, f"must be {noun} {bounds}")

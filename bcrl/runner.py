@@ -135,6 +135,10 @@ def _look_round(plan: Plan) -> None:
     records.check_directory(plan)
     locks.tidy(plan.directory)
     checkpoints.remove_done(plan)
+    if (needed := costs.memory(plan)) > (there := costs.available()):
+        few = "seeds.lockstep=1, fewer episodes, a smaller replay or observations"
+        sizes = f"up to {needed / 2**30:.1f} GiB of memory, of {there / 2**30:.1f} GiB"
+        say(f"{plan.env} {plan.name}: the data of a team take {sizes}; {few} take less")
     done = len(plan.seeds) - len(records.pending(plan))
     if done and plan.config["progress"] != "none":
         said = f"{done} of {len(plan.seeds)} seeds complete"

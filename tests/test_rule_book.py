@@ -116,7 +116,7 @@ def dqn(section, curriculum, tasks, transfers):
             quadratic = getattr(tasks[task], "linear_quadratic", None) is not None
             kind = "lspi" if quadratic and transfers and slot == 0 else "dqn"
         if kind == "lspi":
-            tested, steps = values["evaluation_episodes"][slot], values["steps"][slot]
+            steps, tested = (values[k][slot] for k in ("steps", "evaluation_episodes"))
             made.append(LSPI(steps=steps, evaluation_episodes=tested, **own))
         else:
             left_out = ("name", "learners", "lspi", "hidden")
@@ -270,7 +270,7 @@ REFUSED = {
     "LSPI without a network": (LINEAR, [LSPI(), DEEP], (), "learners"),
     "LSPI twice": (REUSED, LSPI(), (B,), "learners"),
     "LSPI last": (LINEAR[::-1], [DEEP, LSPI()], (SHAPE,), "learners"),
-    "LSPI's steps": (LINEAR, [LSPI(steps=450), DEEP], (B,), "steps"),
+    "LSPI's steps": (LINEAR, [LSPI(steps=2100), DEEP], (B,), "steps"),
     "LSPI's features": (LINEAR, [LSPI(features="cubic"), DEEP], (B,), "lspi.features"),
     "LSPI's noise": (LINEAR, [LSPI(noise_std=0.0), DEEP], (B,), "lspi.noise_std"),
 }

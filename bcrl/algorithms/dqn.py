@@ -12,7 +12,7 @@ from bcrl.identity import Plain
 from bcrl.learners.dqn import DQN
 from bcrl.learners.lspi import LSPI
 from bcrl.q.quadratic import FEATURES
-from bcrl.rules import BOUNDS, capped, check_lspi, course
+from bcrl.rules import BOUNDS, capped, course
 from bcrl.stage import Learner, Stage
 from bcrl.transfer import warm_start
 
@@ -73,8 +73,16 @@ def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
             first = slot == 0 and chosen.transfers != (warm_start,)
             kind = "lspi" if quadratic and first else "dqn"
         if kind == "lspi":
-            check_lspi(chosen, slot, "lspi")
-            learners.append(_lspi(lspi, own))
+            learners.append(
+                LSPI(
+                    lspi.iterations,
+                    own["steps"],
+                    float(lspi.noise_std),
+                    lspi.features,
+                    lspi.drop_last,
+                    own["evaluation_episodes"],
+                )
+            )
         else:
             learners.append(
                 DQN(
@@ -103,18 +111,6 @@ def _per_task(settings: Settings, n: int) -> dict[str, list]:
         key: per_task(f"algorithm.{key}", getattr(settings, key), n, *BOUNDS[key])
         for key in PER_TASK
     }
-
-
-def _lspi(chosen: LSPISettings, own: dict[str, Any]) -> LSPI:
-    """LSPI with a slot's steps."""
-    return LSPI(
-        chosen.iterations,
-        own["steps"],
-        float(chosen.noise_std),
-        chosen.features,
-        chosen.drop_last,
-        own["evaluation_episodes"],
-    )
 
 
 def _lspi_settings(settings: Settings) -> LSPISettings:

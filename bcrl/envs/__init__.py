@@ -42,13 +42,14 @@ def check_tasks(name: str, tasks: Sequence[Env]) -> None:
             here, there = getattr(task, what, None), getattr(target, what, None)
             if here != there:
                 why = f"task {number} has {what} {here}, the target {there}; "
-                why += "in Gymnasium's, a function env.observation makes them equal"
+                why += "expected the same in all tasks"
+                if is_simulated(target) and what == "state_dim":
+                    why += ": a function env.observation makes them so"
                 raise ConfigError("env.tasks", what, why)
     if is_simulated(target):
         target.check_tasks(tasks)
     elif name not in env_names():
-        for task in tasks:
-            _protocol.check(name, task)
+        _protocol.check_tasks(name, tasks)
 
 
 def env_class(name: str) -> type:

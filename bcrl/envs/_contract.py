@@ -87,7 +87,7 @@ class Simulator:
         except PASSING:
             raise
         except BaseException as error:  # whatever foreign code raises, SystemExit too
-            text = f"raised {type(error).__name__}: {_line(error)} ({_place(error)})"
+            text = f"raised {type(error).__name__}: {_line(error)} ({place_of(error)})"
             hint = " reset(*, seed=None, options=None)" if method == "reset" else ""
             why = f"no error; {_pip(error)}mend the environment" + hint
             raise self.broken(method, text, why, "") from error
@@ -227,7 +227,7 @@ def _line(error: BaseException) -> str:
     return lines[0][:200]
 
 
-def _place(error: BaseException) -> str:
+def place_of(error: BaseException) -> str:
     """Where in foreign code an error arose, as `…/file.py:12`."""
     frames = traceback.extract_tb(error.__traceback__)
     files = [f for f in frames if not f.filename.startswith("<")]
