@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bcrl import checkpoints, costs, locks, records, runner, vetting
+from bcrl import checkpoints, costs, files, locks, records, runner, vetting
 from bcrl.compose import Plan
 from bcrl.errors import BcrlError
 from bcrl.progress import named
@@ -102,12 +102,9 @@ def status(arguments: Namespace) -> str:
 def _ever_asked(directory: Path) -> list[int]:
     """The seeds that a variant's folder was ever asked for, by what those begun say."""
     seeds: set[int] = set()
-    for path in directory.glob("seed_*.json"):
-        number = path.stem.partition("_")[2]
-        if not number.isdecimal():
-            continue  # somebody else's; bcrl-verify tells
+    for number in files.seeds_of(directory, "json"):
         try:
-            for first, last in records.read_facts(directory, int(number))["asked"]:
+            for first, last in records.read_facts(directory, number)["asked"]:
                 seeds.update(range(first, min(last, first + MOST) + 1))
         except records.MALFORMED:
             continue

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import platform
+import shlex
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -20,7 +21,14 @@ from numpy.typing import NDArray
 from bcrl import __version__
 from bcrl.compose import Plan
 from bcrl.errors import BcrlError
-from bcrl.files import make_directory, sealed, sha256, write_atomically, write_text
+from bcrl.files import (
+    make_directory,
+    sealed,
+    seed_path,
+    sha256,
+    write_atomically,
+    write_text,
+)
 from bcrl.identity import Plain, differences, identity
 from bcrl.locks import waited_for
 
@@ -41,7 +49,7 @@ def check_directory(plan: Plan) -> None:
     if not present.exists():
         return
     try:
-        before = yaml.safe_load(present.read_text())
+        before = yaml.safe_load(present.read_text("utf-8"))
         changed = differences(before, plan.config)
     except (yaml.YAMLError, OSError, *MALFORMED) as error:
         raise BcrlError(f"{present} can't be read ({error}); move it away") from error
@@ -68,11 +76,6 @@ def begin(plan: Plan) -> None:
             config = identity(plan.config)
             text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
             write_text(directory / "config.yaml", text)
-
-
-def seed_path(directory: Path, seed: int, suffix: str) -> Path:
-    """`seed_0007.csv` and its companions."""
-    return directory / f"seed_{seed:04d}.{suffix}"
 
 
 def is_complete(directory: Path, seed: int) -> bool:
@@ -171,7 +174,7 @@ def closing_table(plans: Sequence[Plan], seconds: float) -> str:
 def read_facts(directory: Path, seed: int) -> Plain:
     """A seed's metadata, nothing if it has none."""
     try:
-        facts = json.loads(seed_path(directory, seed, "json").read_text())
+        facts = json.loads(seed_path(directory, seed, "json").read_text("utf-8"))
     except (OSError, ValueError):
         return {}
     return facts if isinstance(facts, dict) else {}
@@ -180,7 +183,7 @@ def read_facts(directory: Path, seed: int) -> Plain:
 def provenance() -> dict[str, Any]:
     """Versions, git revision and machine."""
     return {
-        "command": " ".join(sys.argv),
+        "command": _typed(sys.argv),
         "versions": {
             "bcrl": __version__,
             "python": platform.python_version(),
@@ -193,6 +196,12 @@ def provenance() -> dict[str, Any]:
             "cores": os.cpu_count(),
         },
     }
+
+
+def _typed(words: Sequence[str]) -> str:
+    """A command line that can be pasted; the program without its folder."""
+    program, *rest = words
+    return shlex.join([Path(program).name, *rest])
 
 
 def _revision() -> dict[str, Any]:
@@ -213,7 +222,8 @@ def _git(*arguments: str) -> str | None:
         done = subprocess.run(
             ["git", "-C", str(here), *arguments],
             capture_output=True,
-            text=True,
+            encoding="utf-8",
+            errors="replace",
             timeout=10,
         )
     except (OSError, subprocess.TimeoutExpired):
@@ -223,7 +233,7 @@ def _git(*arguments: str) -> str | None:
 
 def _processor() -> str:
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
     except OSError:
         return platform.processor()
     names = (line.split(":", 1)[1].strip() for line in lines if "model name" in line)

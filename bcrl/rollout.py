@@ -6,10 +6,10 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.compiling import kept
 from bcrl.envs import Env, is_finite, is_simulated, lanes_of
 from bcrl.policies import greedy, uniform
 from bcrl.q import Q, Table
@@ -173,7 +173,7 @@ def _tabular_rollout(
     return Episodes(env.states()[row], action, reward, absorbing, length, start)
 
 
-@numba.njit(cache=True, nogil=True)
+@kept(nogil=True)
 def _walk(next_row, reward, absorbing, q, first, u, epsilon):
     """Rows (E, T + 1), actions (E, T) and lengths (E,) of one seed's episodes."""
     horizon, episodes = u.shape[0], u.shape[1]

@@ -10,7 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from bcrl import checkpoints, costs, locks, oracle, progress, records, training
+from bcrl import (
+    checkpoints,
+    compiling,
+    costs,
+    locks,
+    oracle,
+    progress,
+    records,
+    training,
+)
 from bcrl.compose import Plan
 from bcrl.envs import Env
 from bcrl.errors import BcrlError
@@ -48,6 +57,8 @@ def run(*plans: Plan) -> None:
     began, options = time.perf_counter(), plans[0].config
     plans, stop = tuple(merged(plans)), Stop()
     failed: Failures = {}
+    if options["progress"] != "none" and (why := compiling.why_uncached()):
+        say(why)
     with stop.on_signals(second_ends_all=True):
         for plan in plans:
             _look_round(plan)

@@ -27,6 +27,7 @@ from bcrl.report.page import Picture, Pictures, page
 from bcrl.report.sweeps import groups, sweep_report, sweep_table
 from bcrl.report.tables import aggregate
 from bcrl.report.variants import Runs
+from bcrl.terminal import ready
 
 #: figure → environment, experiment that makes its runs, method it cannot do without
 FIGURES: dict[str, tuple[str, str, str | None, Callable[..., Figure]]] = {
@@ -172,6 +173,7 @@ def _write_csv(path: Path, table: pd.DataFrame) -> Path:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; 0 if all went well, 2 with one message for what a user can mend."""
+    ready()
     options = parser().parse_args(arguments)
     chosen = [*FIGURES, CURVES]
     if "all" not in options.figures:

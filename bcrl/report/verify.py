@@ -11,6 +11,7 @@ from pathlib import Path
 from bcrl import __version__
 from bcrl.report.findings import BROKEN
 from bcrl.report.integrity import check_tree
+from bcrl.terminal import ready
 
 
 def parser() -> argparse.ArgumentParser:
@@ -30,6 +31,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point: a line a finding, then a summary; the exit code as `--help` says."""
+    ready()
     runs_dir = parser().parse_args(arguments).runs_dir
     variants, findings = check_tree(runs_dir)
     for finding in findings:
