@@ -44,7 +44,8 @@ def dry_run(plans: Sequence[Plan]) -> str:
     wall = _minutes(_wall(seconds, workers))
     total = f"{len(work)} jobs, about {_minutes(sum(seconds))} core minutes"
     last = f"{total}, {wall} min with workers={workers}; nothing was run or written"
-    return "\n".join([*_aligned(rows), *hopeless, last])
+    damaged = [x for plan in plans for x in runner.damage(plan.directory, plan.seeds)]
+    return "\n".join([*_aligned(rows), *damaged, *hopeless, last])
 
 
 def _wall(seconds: Sequence[float], workers: int) -> float:
@@ -140,10 +141,11 @@ def _state(directory: Path, seed: int, facts: Mapping[str, Any]) -> str:
 
 
 def _reasons(asked: Asked) -> Iterator[str]:
-    """A line for each reason why seeds have failed."""
+    """A line for each reason why seeds have failed, or count no more."""
     for why in dict.fromkeys(asked.failed.values()):
         lost = [seed for seed, reason in asked.failed.items() if reason == why]
         yield f"{asked.name}, {named(lost)}: {why}"
+    yield from runner.damage(asked.directory, list(asked.states))
 
 
 def _minutes(seconds: float) -> str:

@@ -10,6 +10,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from bcrl import __version__
 from bcrl.compose import Plan
 from bcrl.errors import BcrlError
 from bcrl.files import (
+    is_intact,
     make_directory,
     sealed,
     seed_path,
@@ -79,11 +81,52 @@ def begin(plan: Plan) -> None:
 
 
 def is_complete(directory: Path, seed: int) -> bool:
-    """Whether this seed's metadata, written last, says that all of it is there."""
+    """Whether a seed's JSON, written last, says so, and its files are unchanged."""
+    return _look(directory, seed)[0]
+
+
+def damaged(directory: Path, seeds: Sequence[int]) -> dict[int, str]:
+    """Seeds with files of a finished run that can't count any more, and why not."""
+    looks = {seed: _look(directory, seed)[1] for seed in seeds}
+    return {seed: why for seed, why in looks.items() if why}
+
+
+def _look(directory: Path, seed: int) -> tuple[bool, str]:
+    stamps = []
+    for suffix in ("json", "csv", "npz"):
+        try:
+            about = seed_path(directory, seed, suffix).stat()
+            stamps.append((about.st_ino, about.st_size, about.st_ctime_ns))
+        except OSError:
+            stamps.append(None)
+    return _checked(directory, seed, *stamps)
+
+
+@lru_cache(maxsize=2**16)
+def _checked(directory: Path, seed: int, *stamps: object) -> tuple[bool, str]:
+    """Whether a seed is complete, and what is wrong with what a finished run left.
+
+    The files are read once for each of their states, which `stamps` tells apart.
+    """
+    if stamps[0] is None:
+        return False, "the JSON is missing" if any(stamps) else ""
     facts = read_facts(directory, seed)
-    complete = (facts.get("status"), facts.get("schema")) == ("complete", SCHEMA)
-    files = [seed_path(directory, seed, suffix) for suffix in ("csv", "npz")]
-    return complete and all(file.exists() for file in files)
+    if not facts or not is_intact(facts):
+        return False, "the JSON was changed or damaged after it was written"
+    if facts.get("schema") != SCHEMA or facts.get("status") != "complete":
+        return False, ""
+    name = "@".join(filter(None, (facts.get("variant"), facts.get("tag"))))
+    home = facts.get("scale"), facts.get("env"), name
+    if (facts.get("seed"), *home) != (seed, *directory.parts[-3:]):
+        return False, "the JSON is another run's"
+    for suffix in ("csv", "npz"):
+        try:
+            data = seed_path(directory, seed, suffix).read_bytes()
+        except OSError as error:
+            return False, f"the {suffix.upper()} can't be read ({error.strerror})"
+        if sha256(data) != facts.get("sha256", {}).get(suffix):
+            return False, f"the {suffix.upper()} was changed after it was written"
+    return True, ""
 
 
 def status(plan: Plan, seed: int) -> str | None:
@@ -175,7 +218,7 @@ def read_facts(directory: Path, seed: int) -> Plain:
     """A seed's metadata, nothing if it has none."""
     try:
         facts = json.loads(seed_path(directory, seed, "json").read_text("utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return facts if isinstance(facts, dict) else {}
 

@@ -135,7 +135,8 @@ def check_complete(plans: Sequence[Plan]) -> None:
 
 def _undone(plan: Plan, seed: int) -> str:
     """Why a seed isn't complete, as far as its files tell."""
-    status = records.status(plan, seed) or "never begun"
+    why = records.damaged(plan.directory, [seed]).get(seed)
+    status = why or records.status(plan, seed) or "never begun"
     if status == "running":
         return "begun, but its process is gone or was told to leave"
     return status.removeprefix("failed: ")
@@ -146,10 +147,21 @@ def _look_round(plan: Plan) -> None:
     records.check_directory(plan)
     locks.tidy(plan.directory)
     checkpoints.remove_done(plan)
+    for line in damage(plan.directory, plan.seeds):
+        say(f"bcrl: {line}")
     done = len(plan.seeds) - len(records.pending(plan))
     if done and plan.config["progress"] != "none":
         said = f"{done} of {len(plan.seeds)} seeds complete"
         say(f"{plan.env} {plan.name}: {said}")
+
+
+def damage(directory: Path, seeds: Sequence[int]) -> Iterator[str]:
+    """A line for each way in which files of finished seeds are damaged."""
+    found = records.damaged(directory, seeds)
+    for why in dict.fromkeys(found.values()):
+        lost = [seed for seed, reason in found.items() if reason == why]
+        name = f"{' '.join(directory.parts[-3:])}, {progress.named(lost)}"
+        yield f"{name}: {why}; a rerun makes {'them' if lost[1:] else 'it'} again"
 
 
 def _groups(seeds: list[int], lockstep: int, workers: int) -> list[Seeds]:
