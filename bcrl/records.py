@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from bcrl import __version__
 from bcrl.compose import Plan
+from bcrl.divergence import diverging
 from bcrl.errors import BcrlError
 from bcrl.files import (
     is_intact,
@@ -33,6 +34,7 @@ from bcrl.files import (
 )
 from bcrl.identity import Plain, differences, identity
 from bcrl.locks import waited_for
+from bcrl.progress import named
 
 SCHEMA = 2  # raised when a file's meaning changes
 MALFORMED = (ValueError, LookupError, TypeError, AttributeError)  # what a file may be
@@ -185,7 +187,27 @@ def write_seed(
         path = seed_path(plan.directory, seed, suffix)
         write_atomically(path, lambda file, data=data: file.write(data))
     hashes = {suffix: sha256(data) for suffix, data in contents.items()}
-    write_status(plan, seed, status, {"sha256": hashes} | facts)
+    columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    found = {"sha256": hashes, "diverging": diverging(columns)}
+    write_status(plan, seed, status, found | facts)
+
+
+def diverged(plan: Plan) -> str | None:
+    """A sentence about the plan's seeds whose values diverge, or None."""
+    facts = {seed: read_facts(plan.directory, seed) for seed in plan.seeds}
+    lost = {
+        seed: fact["diverging"] for seed, fact in facts.items() if fact.get("diverging")
+    }
+    largest: dict[str, float] = {}
+    for values in lost.values():
+        for name, value in values.items():
+            largest[name] = max(value, largest.get(name, 0.0))
+    which = ", ".join(f"{name} up to {value:.3g}" for name, value in largest.items())
+    return (
+        f"{plan.env} {plan.name}, {named(list(lost))}: diverges, {which}"
+        if lost
+        else None
+    )
 
 
 def closing_table(plans: Sequence[Plan], seconds: float) -> str:

@@ -68,6 +68,9 @@ def run(*plans: Plan) -> None:
                 _wait(busy, options["progress"], stop)
     if work:
         raise Interrupted
+    if options["progress"] != "none":
+        for note in filter(None, map(records.diverged, plans)):
+            say(note)
     if len(plans) > 1 and options["progress"] != "none":
         spent = time.perf_counter() - began
         say(records.closing_table(plans, spent))

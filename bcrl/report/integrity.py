@@ -21,6 +21,7 @@ from bcrl.report.notes import listed, ranges
 from bcrl.report.seedfiles import (
     INDEX,
     asked,
+    command,
     family_of,
     read_csv,
     read_document,
@@ -233,6 +234,6 @@ def _incomplete_findings(
 
 def _command(documents: Iterable[dict[str, Any]], seed: int) -> str:
     """What to do about a missing seed: the command that asked for it, if known."""
-    commands = (d.get("command") for d in documents if seed in asked(d))
-    command = next(filter(None, commands), None)
-    return f"{AGAIN} (`{command}`)" if command else AGAIN
+    commands = (command(d) for d in documents if seed in asked(d))
+    found = next(filter(None, commands), None)
+    return f"{AGAIN} (`{found}`)" if found else AGAIN

@@ -28,12 +28,14 @@ def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.mean(values, axis=0)
 
 
-def standard_error(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard error of the mean over seeds: (S, …) → (…).
+def standard_error(values: NDArray[np.float64], ddof: int = 0) -> NDArray[np.float64]:
+    """Standard error of the mean over seeds: (S, …) → (…), nan if S ≤ ddof.
 
-    Deviation with ddof = 0 over √S, as in the paper's released evaluation.
+    The paper's figures have ddof = 0, as its released evaluation; tables have 1.
     """
-    return np.std(values, axis=0, ddof=0) / math.sqrt(len(values))
+    if len(values) <= ddof:
+        return np.full(values.shape[1:], math.nan)
+    return np.std(values, axis=0, ddof=ddof) / math.sqrt(len(values))
 
 
 def interquartile_mean(values: ArrayLike) -> float:
