@@ -59,5 +59,8 @@ def show(text: str) -> None:
     """What was asked for, on standard output, as far as anybody reads it."""
     try:
         print(text, flush=True)
-    except BrokenPipeError:  # what is still buffered must not fail again at exit
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError):  # a full disk, say
+            say(f"bcrl: standard output can't be written: {error.strerror}")
+        # What is still buffered must not fail again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -179,6 +179,19 @@ def test_an_ascii_terminal_gets_escapes(monkeypatch):
     assert out.buffer.getvalue() == b"\\u03f1 \\u2013 1\n"
 
 
+@pytest.mark.parametrize("command", ["report.cli", "report.verify"])
+def test_a_full_or_closed_output_is_no_traceback(command, tmp_path):
+    made(tmp_path / "runs", range(1))
+    line = f"{sys.executable} -m bcrl.{command}"
+    line += " --scale smoke --figures curves" * (command == "report.cli")
+    for output in ("/dev/full", "/dev/null <&- 2>&-"):
+        done = subprocess.run(
+            f"{line} >{output}", shell=True, cwd=tmp_path, stderr=subprocess.PIPE
+        )
+        assert done.returncode == 0 and b"Traceback" not in done.stderr, done.stderr
+        assert (b"No space left" in done.stderr) == (output == "/dev/full")
+
+
 @pytest.mark.parametrize("closed", ["<&- >&- 2>&-", ">&-", "2>&-"])
 def test_closed_streams_take_no_file(closed, tmp_path):
     program = (
