@@ -19,7 +19,7 @@ from bcrl.composed import CONF, CONFIG_NAME
 from bcrl.errors import BcrlError
 from bcrl.files import make_directory
 from bcrl.interrupts import EXIT_CODE, Interrupted
-from bcrl.terminal import say, show
+from bcrl.terminal import ready, say, show
 
 if TYPE_CHECKING:
     from bcrl.compose import Plan
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 def main() -> None:
     """Console entry point; refuses bad input with one message before any work."""
+    ready()
     guard.register()
     try:
         with guard.refusals():

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bcrl import probes
+from bcrl import compiling, probes
 from bcrl.algorithms import algorithm
 from bcrl.composition import Composition, composition
 from bcrl.config import Choice, Config, construct, one_of
@@ -78,6 +78,7 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
     the config departs from all of them, its results get a directory of their own, below
     the name of the `env` choice.
     """
+    compiling.check()
     _check_outputs(config)
     check_name("env", env)
     tasks, metrics = _tasks(config["env"])

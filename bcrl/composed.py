@@ -104,7 +104,7 @@ def _keys_of_options(folders: Folders) -> dict[str, list[str]]:
             found.setdefault(group, [])
             try:
                 check_file(path)
-                text = path.read_text()
+                text = path.read_text("utf-8")
                 values = yaml.safe_load(text)
             except (BcrlError, OSError, ValueError, yaml.YAMLError):
                 continue  # whoever chooses it will be told

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import sys
 import textwrap
@@ -16,6 +17,7 @@ from hydra._internal.utils import get_args_parser
 
 from bcrl.composed import CONF, PACKAGE
 from bcrl.errors import BcrlError, guess
+from bcrl.files import user_folder
 
 HELP = PACKAGE / "help.txt"
 WIDTH, HANGING = 88, 21  # columns of the help, and where an option's text begins
@@ -39,8 +41,8 @@ def arguments() -> Namespace:
     folder = asked.config_dir
     if asked.shell_completion:
         folder = _completed(flags).config_dir
-    if folder is None and own_folder().is_dir():
-        folder = str(own_folder())
+    if folder is None and (own := own_folder()):
+        folder = str(own)
     if folder != asked.config_dir:
         given.append(f"--config-dir={folder}")
     asked.config_dir = folder
@@ -57,16 +59,16 @@ def parser() -> argparse.ArgumentParser:
     return result
 
 
-def own_folder() -> Path:
-    """The user's folder of configs, which need not be there: ~/.config/bcrl."""
-    base = os.environ.get("XDG_CONFIG_HOME") or os.path.expanduser("~/.config")
-    return Path(base, "bcrl")
+def own_folder() -> Path | None:
+    """The user's folder of configs, ~/.config/bcrl, if it is there."""
+    base = user_folder("XDG_CONFIG_HOME", ".config")
+    return base / "bcrl" if base and (base / "bcrl").is_dir() else None
 
 
 def manual(config_dir: str | None) -> str:
     """The help, with the options of every group, those of a folder of one's own too."""
     folders = [CONF, *([Path(config_dir)] if config_dir else [])]
-    text = Template(HELP.read_text())
+    text = Template(HELP.read_text("utf-8"))
     options = {
         name: ", ".join(_options(folders, name.replace("__", "/")))
         for name in text.get_identifiers()
@@ -93,7 +95,7 @@ def _completed(flags: argparse.ArgumentParser) -> Namespace:
         print(*(name for name in _names(flags) if name.startswith(words[-1])))
         sys.exit(0)
     try:
-        with open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):
+        with redirect_stderr(io.StringIO()):
             typed, _ = flags.parse_known_intermixed_args(words)
     except SystemExit:  # a flag's own argument is missing: the shell proposes files
         sys.exit(0)

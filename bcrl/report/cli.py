@@ -27,6 +27,7 @@ from bcrl.report.page import Picture, Pictures, page
 from bcrl.report.sweeps import groups, sweep_report, sweep_table
 from bcrl.report.tables import aggregate
 from bcrl.report.variants import Runs
+from bcrl.terminal import ready, say, show
 
 #: figure → environment, experiment that makes its runs, method it cannot do without
 FIGURES: dict[str, tuple[str, str, str | None, Callable[..., Figure]]] = {
@@ -172,6 +173,7 @@ def _write_csv(path: Path, table: pd.DataFrame) -> Path:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; 0 if all went well, 2 with one message for what a user can mend."""
+    ready()
     options = parser().parse_args(arguments)
     chosen = [*FIGURES, CURVES]
     if "all" not in options.figures:
@@ -179,7 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         runs = load_runs(options.runs_dir, options.scale, options.allow_incomplete)
         for note in runs.notes:
-            print(f"note: {note.text}", file=sys.stderr)
+            say(f"note: {note.text}")
         out = options.out or options.runs_dir / "figures"
         make_directory(out, "--out")
         shown, not_shown = [], []
@@ -188,11 +190,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         files, skipped = report(runs, out, chosen, options.tag)
         files, skipped = files + shown, skipped + not_shown
     except BcrlError as error:
-        print(f"bcrl-report: {error}", file=sys.stderr)
+        say(f"bcrl-report: {error}")
         return 2
     for line in skipped if options.scale != "search" else ():
-        print(f"skipped {line}", file=sys.stderr)
-    print("\n".join(map(str, files)))
+        say(f"skipped {line}")
+    show("\n".join(map(str, files)))
     return 0
 
 

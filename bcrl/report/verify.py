@@ -11,6 +11,7 @@ from pathlib import Path
 from bcrl import __version__
 from bcrl.report.findings import BROKEN
 from bcrl.report.integrity import check_tree
+from bcrl.terminal import ready, say, show
 
 
 def parser() -> argparse.ArgumentParser:
@@ -30,19 +31,20 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point: a line a finding, then a summary; the exit code as `--help` says."""
+    ready()
     runs_dir = parser().parse_args(arguments).runs_dir
     variants, findings = check_tree(runs_dir)
     for finding in findings:
-        print(f"{finding.kind}: {finding}")
+        show(f"{finding.kind}: {finding}")
     if not variants:
         why = "holds no runs" if runs_dir.is_dir() else "is not a folder"
-        print(f"bcrl-verify: {runs_dir} {why}; name a runs_dir", file=sys.stderr)
+        say(f"bcrl-verify: {runs_dir} {why}; name a runs_dir")
         return 2
     complete = sum(len(variant.tables) for variant in variants)
     counts = Counter(finding.kind for finding in findings)
     wrong = ", ".join(f"{n} {kind}" for kind, n in counts.items()) or "nothing wrong"
     done = f"{_number(len(variants), 'variant')}, {_number(complete, 'seed')} complete"
-    print(f"{done}; {wrong}")
+    show(f"{done}; {wrong}")
     return 2 if counts[BROKEN] else 1 if findings else 0
 
 
