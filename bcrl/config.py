@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, get_type_hints
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING
+from omegaconf import MISSING, DictConfig, OmegaConf
 
 from bcrl.errors import ConfigError, did_you_mean
 
@@ -17,7 +17,8 @@ from bcrl.errors import ConfigError, did_you_mean
 @dataclass
 class Seeds:
     first: int = 0
-    count: int = 3
+    count: int | None = 3  # null: those of `only`
+    only: list[int] | None = None
     lockstep: int | None = None  # seeds that train together; null: the algorithm's
     part: str | None = None  # "2/5": the second of five parts of them; null: all
 
@@ -60,6 +61,27 @@ class Config:
 def register() -> None:
     """Make the schema known to Hydra as `schema`."""
     ConfigStore.instance().store(name="schema", node=Config)
+
+
+def section_of_seeds(key: str, value: object) -> dict[str, Any]:
+    """`seeds=5`, `seeds=[3,7]` and `seed=3` as keys of the section `seeds`."""
+    if type(value) is int:
+        return {"count": value} if key == "seeds" else {"count": None, "only": [value]}
+    if isinstance(value, list):
+        return {"count": None, "only": list(value)}
+    if isinstance(value, Mapping) and key == "seeds" and not {"count", "only"} <= {*value}:
+        return ({"count": None} if value.get("only") else {}) | dict(value)
+    why = "how many (seeds=5), just these (seeds=[3,7,11]), or one (seed=3)"
+    raise ConfigError(key, value, why)
+
+
+def seeds_of(config: Any) -> None:
+    """Write `seeds: 5`, `seeds: [3, 7]` and `seed: 3` of a file as the section's keys."""
+    for key in ("seed", "seeds"):
+        if isinstance(config, DictConfig) and config.get(key) is not None:
+            value = OmegaConf.to_container(config, resolve=False).pop(key)
+            del config[key]
+            config["seeds"] = section_of_seeds(key, value)
 
 
 def one_of(key: str, value: object, allowed: Sequence[str]) -> None:

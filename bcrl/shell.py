@@ -6,7 +6,6 @@ import argparse
 import os
 import sys
 import textwrap
-import time
 from argparse import Namespace
 from contextlib import redirect_stderr
 from pathlib import Path
@@ -14,37 +13,36 @@ from string import Template
 
 from hydra._internal.utils import get_args_parser
 
+from bcrl import __version__
 from bcrl.composed import CONF, PACKAGE
 from bcrl.errors import BcrlError, guess
 
 HELP = PACKAGE / "help.txt"
 WIDTH, HANGING = 88, 21  # columns of the help, and where an option's text begins
-STARTED = "BCRL_STARTED"  # when the command began: a debug run's folder
 LINE = "COMP_LINE"  # the environment variable with the line that Tab is to complete
 
 
 def arguments() -> Namespace:
     """What the command line asks for; BcrlError for a flag that there isn't.
 
-    `sys.argv` is put into the order that Hydra wants, flags first; people write them
-    anywhere. A folder of configs that isn't named is the user's own, if there is one.
+    Its `flags` are all words but the overrides. A folder of configs that isn't named is
+    the user's own, if there is one.
     """
-    os.environ.setdefault(STARTED, time.strftime("%Y-%m-%d_%H-%M-%S"))
     flags = parser()
     asked, unknown = flags.parse_known_intermixed_args()
     if unknown:
         close = guess(unknown[0].partition("=")[0], _names(flags))
         raise BcrlError(f"{unknown[0]}: unknown flag; {close or 'see bcrl --help'}")
-    given = [word for word in sys.argv[1:] if word not in asked.overrides]
+    asked.flags = [word for word in sys.argv[1:] if word not in asked.overrides]
     folder = asked.config_dir
     if asked.shell_completion:
         folder = _completed(flags).config_dir
     if folder is None and own_folder().is_dir():
         folder = str(own_folder())
-    if folder != asked.config_dir:
-        given.append(f"--config-dir={folder}")
+    if folder is not None:  # a launcher's process may be in another
+        folder = os.path.abspath(folder)
+        asked.flags.append(f"--config-dir={folder}")
     asked.config_dir = folder
-    sys.argv[1:] = given + asked.overrides
     return asked
 
 
@@ -52,6 +50,8 @@ def parser() -> argparse.ArgumentParser:
     """Hydra's flags and ours."""
     result = get_args_parser()
     result.prog = "bcrl"
+    shown = next(a for a in result._actions if "--version" in a.option_strings)
+    shown.version, shown.help = f"bcrl {__version__}", "show bcrl's version"
     result.add_argument("--dry-run", action="store_true", help="list jobs and costs")
     result.add_argument("--status", action="store_true", help="list what is done")
     return result

@@ -19,6 +19,7 @@ from bcrl.composed import CONF, CONFIG_NAME, Folders, composed
 from bcrl.errors import BcrlError, did_you_mean, guess
 from bcrl.identity import Plain, differences
 from bcrl.sweeps import experiments, first_lines, over_experiments, parse, product
+from bcrl.typed import canonical
 
 #: The choices that make a variant; a run is compared with these at their defaults.
 VARIANT_GROUPS = ("env", "algorithm", "curriculum", "boosting", "transfer", "scale")
@@ -95,9 +96,11 @@ def _running(job: DictConfig) -> Plain:
 
 
 def _composed(arguments: Namespace) -> tuple[Folders, list[DictConfig]]:
-    """The folders of configs besides ours, and each job composed."""
+    """The folders of configs besides ours, and each job composed.
+
+    The arguments' overrides are canonical then.
+    """
     name = arguments.config_name or CONFIG_NAME
-    parsed = parse(arguments.overrides)
     folders: Folders = ()
     if arguments.config_dir:
         folder = Path(arguments.config_dir).absolute()
@@ -106,6 +109,8 @@ def _composed(arguments: Namespace) -> tuple[Folders, list[DictConfig]]:
             text = f"--config-dir: there is no folder {folder}"
             raise BcrlError(f"{text}; {close}" if close else text)
         folders = (str(folder),)
+    arguments.overrides = canonical(arguments.overrides, folders)
+    parsed = parse(arguments.overrides)
     searchpath = [o for o in parsed if o.key_or_group == "hydra.searchpath"]
     parsed = [o for o in parsed if o not in searchpath]
     for override in searchpath:
