@@ -30,6 +30,9 @@ def main() -> None:
     guard.register()
     try:
         with guard.refusals():
+            if not sys.argv[1:]:
+                show(shell.short())
+                sys.exit(2)
             arguments = shell.arguments()
             if arguments.help:
                 show(shell.manual(arguments.config_dir))

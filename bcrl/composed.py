@@ -23,7 +23,22 @@ PACKAGE = Path(__file__).resolve().parent
 #: In a wheel the configs lie inside the package, in a checkout beside it.
 CONF = next(p for p in (PACKAGE / "conf", PACKAGE.parent / "conf") if p.is_dir())
 CONFIG_NAME = "config"
+#: What Hydra says of a key that can't be overridden, added or deleted.
+UNKNOWN = re.compile(
+    r"Could not override '([^']+)'|Could not append.* already at '([^']+)'"
+    r"|Could not delete from config\. '([^']+)' does not exist"
+    r"|Multiple values for ([^.\s]+)\."
+)
+NO_ENV = "You must specify 'env'"
 Folders = tuple[str, ...]  # of configs, besides our own
+
+
+class Unknown(BcrlError):
+    """A key that there isn't, or an option of a group."""
+
+    def __init__(self, text: str, key: str, option: str | None = None) -> None:
+        super().__init__(text)
+        self.key, self.option = key, option
 
 
 @cache
@@ -38,7 +53,7 @@ def composed(name: str, overrides: tuple[str, ...], folders: Folders) -> DictCon
     except BcrlError:
         raise
     except MissingConfigException as error:
-        raise BcrlError(_missing(error)) from error
+        raise _missing(error) from error
     except (HydraException, OmegaConfBaseException) as error:
         message = first_lines(error)
     except Exception as error:  # e.g. YAML's own; composing runs nothing of ours
@@ -47,21 +62,25 @@ def composed(name: str, overrides: tuple[str, ...], folders: Folders) -> DictCon
         )
         text = f"the configs can't be read: {first_lines(error)}{hint}"
         raise BcrlError(text) from error
-    if unknown := re.match(r"Could not override '([^']+)'", message):
-        key = unknown[1]
-        meant = f"one that isn't there is added with +{key}"
-        if not key.startswith("hydra."):
-            meant = _meant(name, key, overrides, folders)
-        message = f"{key}: unknown key; {meant}"
+    if unknown := UNKNOWN.match(message):
+        key = next(filter(None, unknown.groups()))
+        if key.startswith("hydra."):
+            raise BcrlError(
+                f"{key}: unknown key; one that isn't there is added with +{key}"
+            )
+        raise Unknown(f"{key}: unknown key", key)
+    if message.startswith(NO_ENV):
+        raise Unknown(message, "env")
     raise BcrlError(message)
 
 
-def _missing(error: MissingConfigException) -> str:
-    wanted = error.missing_cfg_file or ""
-    group, _, option = wanted.rpartition("/")
+def _missing(error: MissingConfigException) -> BcrlError:
+    group, _, option = (error.missing_cfg_file or "").rpartition("/")
     if not group or error.options is None:
-        return first_lines(error)
-    return f"{group}={option}: {did_you_mean(option, error.options)}"
+        return BcrlError(first_lines(error))
+    return Unknown(
+        f"{group}={option}: {did_you_mean(option, error.options)}", group, option
+    )
 
 
 def keys_of_options(folders: Folders) -> dict[str, dict[str, Any]]:
@@ -71,7 +90,9 @@ def keys_of_options(folders: Folders) -> dict[str, dict[str, Any]]:
     """
     found: dict[str, dict[str, Any]] = {}
     for folder in map(Path, (CONF, *folders)):
-        for place in {p.parent for n in ("*", "*/*") for p in folder.glob(f"{n}/*.yaml")}:
+        for place in {
+            p.parent for n in ("*", "*/*") for p in folder.glob(f"{n}/*.yaml")
+        }:
             group = place.relative_to(folder).as_posix()
             found.setdefault(group, {})
             for key, values in keys_of_group(group, folders).items():

@@ -25,6 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from bcrl import bounds, config, safety
 from bcrl.errors import BcrlError
+from bcrl.identity import flat
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 STARTED = "BCRL_STARTED"  # when the command began, in its jobs' processes, too
@@ -51,9 +52,22 @@ class Files(FileConfigSource):
             return super().load_config(config_path)
         bounds.check_file(Path(self.path, name))
         loaded = super().load_config(config_path)
-        if loaded.header.get("package") == "_global_" or os.sep not in name:
+        package = loaded.header.get("package") or os.path.dirname(name)
+        if package in ("", "_global_"):
             config.seeds_of(loaded.config)
+        _check_texts(package, loaded.config)
         return loaded
+
+
+def _check_texts(package: str, loaded: Any) -> None:
+    """Raise Refused where a file has a number for what is text: `tag: 1e3`."""
+    if not isinstance(loaded, DictConfig):
+        return
+    place = "" if package == "_global_" else package.replace("/", ".") + "."
+    for key, value in flat(OmegaConf.to_container(loaded, resolve=False)).items():
+        name = f"{place}{key}".lstrip(".")
+        if isinstance(value, (int, float)) and name in config.texts():
+            raise Refused(f"{name}={value}: quote it where it is a name")
 
 
 class Packages(ImportlibResourcesConfigSource):

@@ -9,21 +9,16 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import is_dataclass
-from functools import cache
 from pathlib import Path, PurePath
-from types import UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any
 
-from hydra.conf import HydraConf
 from hydra.core.override_parser.types import ChoiceSweep, Glob
-from hydra_plugins.hydra_joblib_launcher.config import JobLibLauncherConf
-from hydra_plugins.hydra_submitit_launcher.config import SlurmQueueConf
 
 from bcrl import guard
 from bcrl.composed import CONF, Folders, keys_of_group
-from bcrl.config import Config, section_of_seeds
+from bcrl.config import section_of_seeds, texts
 from bcrl.errors import ConfigError
+from bcrl.safety import NAME
 from bcrl.sweeps import parse
 
 #: A quoted string, or bare text up to what ends it.
@@ -67,12 +62,19 @@ def _canonical(text: str, folders: Folders) -> Iterator[str]:
         if not names:
             why = f"matches none of {key}'s options"
             raise ConfigError(key, raw, f"{why}: {', '.join(options(key, folders))}")
-        yield f"{head}={','.join(map(_quoted, names))}"
+        plain = all(map(NAME.fullmatch, names))
+        yield f"{head}={','.join(names if plain else map(_quoted, names))}"
     elif key == "hydra.searchpath":
         yield f"{head}={_words(raw, _folder)}"
-    elif not COMPUTED.match(raw) and (
-        named := _words(CHOICE.sub(r"\1", raw), _within if key == "runs_dir" else _name)
-    ) != raw:
+    elif (
+        not COMPUTED.match(raw)
+        and (
+            named := _words(
+                CHOICE.sub(r"\1", raw), _within if key == "runs_dir" else _name
+            )
+        )
+        != raw
+    ):
         yield f"{head}={named}" if _is_text(key, folders) else text
     else:
         yield text
@@ -127,7 +129,7 @@ def _folder(text: str, quoted: bool) -> str | None:
 
 def _is_text(key: str, folders: Folders) -> bool:
     """Whether a key's value is text: by the schema, or by an option that has the key."""
-    if key in _schema() or any(Path(f, key).is_dir() for f in (CONF, *folders)):
+    if key in texts() or any(Path(f, key).is_dir() for f in (CONF, *folders)):
         return True
     parts = key.split(".")
     groups = ["/".join(parts[:n]) for n in range(1, len(parts))]
@@ -138,21 +140,3 @@ def _is_text(key: str, folders: Folders) -> bool:
 
 def _parts(value: Any) -> list:
     return value if isinstance(value, list) else [value]
-
-
-@cache
-def _schema() -> frozenset[str]:
-    """The keys that a schema declares as text."""
-    found = set(_texts(Config, "")) | set(_texts(HydraConf, "hydra."))
-    for launcher in (JobLibLauncherConf, SlurmQueueConf):
-        found |= set(_texts(launcher, "hydra.launcher."))
-    return frozenset(found)
-
-
-def _texts(cls: type, prefix: str) -> Iterator[str]:
-    for name, hint in get_type_hints(cls).items():
-        either = get_args(hint) if get_origin(hint) in (Union, UnionType) else [hint]
-        if str in either:
-            yield prefix + name
-        elif is_dataclass(hint):
-            yield from _texts(hint, f"{prefix}{name}.")
