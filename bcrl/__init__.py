@@ -12,4 +12,4 @@ if (
 ):  # a command starts: until there is work to save, Ctrl-C ends it without a word
     _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 
-import bcrl.gym  # noqa: E402, F401  registers our environments with Gymnasium
+import bcrl.gym  # noqa: F401  registers our environments with Gymnasium

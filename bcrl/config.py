@@ -86,7 +86,7 @@ def section_of_seeds(key: str, value: object) -> dict[str, Any]:
 
 
 def seeds_of(config: Any) -> None:
-    """Write `seeds: 5`, `seeds: [3, 7]` and `seed: 3` of a file as the section's keys."""
+    """Write a file's `seeds: 5`, `seeds: [3, 7]` or `seed: 3` as the section's keys."""
     for key in ("seed", "seeds"):
         if isinstance(config, DictConfig) and config.get(key) is not None:
             value = OmegaConf.to_container(config, resolve=False).pop(key)
@@ -115,7 +115,7 @@ def _texts(cls: type, prefix: str) -> Iterator[str]:
 
 
 def check_launcher(section: DictConfig) -> None:
-    """Raise ConfigError for a launcher's key that is unknown, of another type or size."""
+    """Raise ConfigError for a launcher's unknown key, or a value of another type or size."""
     values = OmegaConf.to_container(section, resolve=True)
     schema = LAUNCHERS.get(str(values["_target_"]).rpartition(".")[2])
     known = schema and OmegaConf.structured(schema)

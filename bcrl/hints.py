@@ -120,11 +120,10 @@ class Hints:
         if value is None:
             return self._option_of_any(key)
         value = value.strip()
-        if norm.endswith("device") or norm in ("use_cuda", "cuda", "gpu"):
-            if value.lower() in ("true", "1", "yes") or re.match(
-                "cuda|gpu", value.lower()
-            ):
-                return "device=cuda"
+        if re.fullmatch(r"(use_)?(cuda|gpu)|.*device", norm) and re.match(
+            "cuda|gpu|true|yes|1", value.lower()
+        ):
+            return "device=cuda"
         for name in dict.fromkeys((ALIASES.get(norm, norm), norm)):
             if (found := self._exact(name)) is not None:
                 return self._with(found, value)
@@ -158,9 +157,9 @@ class Hints:
 
     def _with(self, key: str, value: str) -> str:
         """The key with its value, and before it the option that brings the key."""
+        if key in ("env", "env.id") and (ours := self.gymnasium(value)):
+            return ours
         if key in self.groups:
-            if key == "env" and (ours := self.gymnasium(value)):
-                return ours
             return f"{key}={self.option(key, value) or value or '…'}"
         value = VALUES.get(key, {}).get(value.lower(), value)
         if key in ("seeds", "seed"):
@@ -225,7 +224,7 @@ class Hints:
                 line = f"-m {head}=0.1,0.5 or -m {head}=range(0,1,0.25)"
                 yield f"{typed}: an interval is for optimisers; list values: {line}"
             elif key == "hydra/sweeper" and value != "basic":
-                yield f"{typed}: there is one sweeper; leave it out, or hydra/sweeper=basic"
+                yield f"{typed}: the only sweeper is basic; did you mean hydra/sweeper=basic?"
             elif key in ("seed", "seeds") and isinstance(value, (RangeSweep, str)):
                 yield f"{typed}: did you mean {numbers(key, raw)}?"
             elif isinstance(value, Sweep) or override.is_delete():
@@ -234,7 +233,7 @@ class Hints:
                 yield f"{typed}: did you mean {key}={VALUES[key][str(value).lower()]}?"
 
     def check(self) -> None:
-        """Raise BcrlError for a word that is no KEY=VALUE, or whose value is a habit's."""
+        """Raise BcrlError for a word that is no KEY=VALUE, or has another tool's value."""
         for word in self.overrides:
             check_override(word)
         for word, value in bare(self.overrides):
@@ -320,7 +319,7 @@ def numbers(key: str, value: str) -> str:
     )
     if dashed or ("range" in value and len(found) == 2):
         first, last = found
-        after = last if "range" in value or dashed and dashed[2] == ":" else last + 1
+        after = last if "range" in value or (dashed and dashed[2] == ":") else last + 1
         if first == 0:
             return f"seeds={after}"
         return f"seeds=[{','.join(map(str, range(first, min(after, first + 20))))}]"

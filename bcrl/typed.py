@@ -1,7 +1,7 @@
 """What is typed, in the one form that Hydra takes as it is meant.
 
-Hydra guesses types: `tag=1e3` would be 1000.0. Here a name stays the name that was typed,
-`seeds=5`, `seeds=[3,7]` and `seed=3` become keys, a folder that was typed becomes absolute.
+Hydra guesses types: `tag=1e3` would be 1000.0. Here a name stays what was typed,
+`seeds=5`, `seeds=[3,7]` and `seed=3` become keys, a folder outside becomes absolute.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def _folder(text: str, quoted: bool) -> str | None:
 
 
 def _is_text(key: str, folders: Folders) -> bool:
-    """Whether a key's value is text: by the schema, or by an option that has the key."""
+    """Whether a key's value is text by the schema, or by an option that has the key."""
     if key in texts() or any(Path(f, key).is_dir() for f in (CONF, *folders)):
         return True
     parts = key.split(".")

@@ -241,8 +241,8 @@ def _jobs(
     if not multirun and first.mode != RunMode.MULTIRUN:
         swept = [o.input_line for o in overrides if o.is_sweep_override()]
         if swept:
-            text = f"{swept[0]}: several values are a sweep; add -m: bcrl -m {swept[0]}"
-            raise BcrlError(text)
+            line = shlex.join(["bcrl", "-m", *(o.input_line for o in overrides)])
+            raise BcrlError(f"{swept[0]}: several values are a sweep; add -m: {line}")
         return jobs
     params = [f"{k}={v}" for k, v in (first.sweeper.get("params") or {}).items()]
     return product(parse(params) + overrides)
