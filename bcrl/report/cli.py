@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import inspect
 import sys
 from collections.abc import Callable, Sequence
@@ -11,11 +10,11 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bcrl import __version__
 from bcrl.errors import BcrlError
 from bcrl.files import make_directory, write_text
 from bcrl.report import style
 from bcrl.report.animation import animations, gif_of
+from bcrl.report.arguments import Parser
 from bcrl.report.curves import LINEAR, figure_methods
 from bcrl.report.document import claims_report
 from bcrl.report.figures import env_title, figure_1, figure_2, figure_5
@@ -41,15 +40,12 @@ FIGURES: dict[str, tuple[str, str, str | None, Callable[..., Figure]]] = {
 CURVES = "curves"  # learning curves of what the paper has no figure of
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """The command line; its help is the reference."""
-    result = argparse.ArgumentParser(
+    result = Parser(
         prog="bcrl-report",
         description="Draw figures of finished runs, judge the paper's claims, and show "
         "all of it on one HTML page.",
-    )
-    result.add_argument(
-        "--runs-dir", type=Path, default=Path("runs"), help="default: %(default)s"
     )
     result.add_argument(
         "--scale",
@@ -82,7 +78,6 @@ def parser() -> argparse.ArgumentParser:
         help="draw what is complete of unfinished runs, and say so in every figure",
     )
     result.add_argument("--out", type=Path, help="default: figures in the runs' folder")
-    result.add_argument("--version", action="version", version=__version__)
     return result
 
 
@@ -174,11 +169,11 @@ def _write_csv(path: Path, table: pd.DataFrame) -> Path:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; 0 if all went well, 2 with one message for what a user can mend."""
     ready()
-    options = parser().parse_args(arguments)
-    chosen = [*FIGURES, CURVES]
-    if "all" not in options.figures:
-        chosen = list(dict.fromkeys(options.figures))
     try:
+        options = parser().asked(arguments)
+        chosen = [*FIGURES, CURVES]
+        if "all" not in options.figures:
+            chosen = list(dict.fromkeys(options.figures))
         runs = load_runs(options.runs_dir, options.scale, options.allow_incomplete)
         for note in runs.notes:
             say(f"note: {note.text}")
