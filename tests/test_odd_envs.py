@@ -10,7 +10,7 @@ import pytest
 
 from bcrl import runner, vetting
 from bcrl.api import DQN, FQI, Forest, Gymnasium, run, stages
-from bcrl.errors import BcrlError, SeedsFailed
+from bcrl.errors import BcrlError
 from bcrl.rollout import rollout
 from tests import odd
 from tests.conftest import arguments, plan
@@ -184,7 +184,9 @@ def test_a_simulator_that_fails_in_a_run_fails_its_seed_alone(more, tmp_path):
         if not doom:
             runner.run(made)
         else:
-            with pytest.raises(SeedsFailed, match=r"env\.id=odd/FailsLate-v0") as lost:
+            with pytest.raises(
+                runner.SeedsFailed, match=r"env\.id=odd/FailsLate-v0"
+            ) as lost:
                 runner.run(made)
             assert "RuntimeError: the motor is stuck (…/odd.py:" in str(lost.value)
         found = sorted(made.directory.glob("seed_*.json"))
