@@ -18,7 +18,7 @@ from bcrl.envs import _simulators as simulators
 from bcrl.envs._contract import Simulator, plain_parts
 from bcrl.envs._lanes import SimulatedLanes
 from bcrl.envs._success import RULES, default
-from bcrl.envs._trial import TRIES, once, trial
+from bcrl.envs._trial import FRESH, TRIES, once, trial
 from bcrl.envs.base import check_episodes
 from bcrl.errors import BcrlError, ConfigError, at_least, did_you_mean
 
@@ -128,7 +128,12 @@ class Gymnasium:
         return hash((self.id, self.horizon, self.gamma))  # dicts have none
 
     def __reduce__(self) -> tuple:
-        return _made, (_fields(self),)  # what is cached stays here
+        return _made, (_fields(self), self.fresh)  # what is cached stays here
+
+    @property
+    def fresh(self) -> bool:
+        """Whether every episode needs a new simulator, as random play has shown."""
+        return _measured(self) in FRESH
 
     @property
     def actions(self) -> NDArray[np.float64] | None:
@@ -287,8 +292,11 @@ def _no_vector(task: Gymnasium, space: spaces.Space) -> str:
     return f"{why}env.observation=module.function makes an array of them"
 
 
-def _made(fields: dict[str, Any]) -> Gymnasium:
-    return Gymnasium(**fields)
+def _made(fields: dict[str, Any], fresh: bool) -> Gymnasium:
+    task = Gymnasium(**fields)
+    if fresh:
+        FRESH.add(_measured(task))
+    return task
 
 
 ENV = Gymnasium
