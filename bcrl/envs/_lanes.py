@@ -124,6 +124,8 @@ class SimulatedLanes:
     def _reset(self, lane: int) -> NDArray[np.float64] | float:
         """A lane's first observation; 0 if it has failed."""
         seed = int(self.start.reshape(-1)[lane] * SEEDS)
+        if self.env.renew and lane not in self.failures and self.running[lane].used:
+            self._open(lane)
         for attempt in range(2):
             if lane in self.failures:
                 break

@@ -43,8 +43,9 @@ class Gymnasium:
     Tasks differ in `kwargs` of the constructor, in `attributes` set on the unwrapped
     environment, in `wrappers` ({name: …, arguments}) or in any other field.
     `starts` episodes measure each FQI iteration. `action_vectors` (A, k) say what each
-    action does, which residual policies want to know. `verify=False` allows tasks that
-    random play can't tell apart. Raises ConfigError for whatever of it can't be.
+    action does, which residual policies want to know. `renew` makes a new simulator for
+    each episode, for those whose state outlives a reset. `verify=False` allows tasks
+    that random play can't tell apart. Raises ConfigError for whatever of it can't be.
     """  # noqa: E501
 
     id: str
@@ -58,6 +59,7 @@ class Gymnasium:
     success_threshold: Any = None
     starts: int = 20
     action_vectors: Any = None
+    renew: bool = False
     verify: bool = True
 
     name: ClassVar[str] = "gymnasium"
@@ -206,7 +208,8 @@ class Gymnasium:
             if seen.unsteady:
                 why = f"{seen.unsteady} is another after the same reset and actions; "
                 why += "expected the same each time: randomness from reset(seed=…) "
-                why += "only, no state that outlives a reset or that simulators share"
+                why += "only, no state that outlives a reset (env.renew=true makes a "
+                why += "new simulator for each episode) or that simulators share"
                 raise ConfigError("env.id", task.id, why)
             if seen.adapted:
                 once(f"env.id={task.id}: {'; '.join(seen.adapted)}")
