@@ -1,5 +1,15 @@
 """Boosted Curriculum Reinforcement Learning (Klink et al., ICLR 2022), reproduced."""
 
+import os as _os
+import signal as _signal
+import sys as _sys
+
 __version__ = "0.1.0"
+
+if (
+    _os.path.basename((_sys.argv or [""])[0]).startswith("bcrl")
+    and _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler
+):  # a command starts: until there is work to save, Ctrl-C ends it without a word
+    _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 
 import bcrl.gym  # noqa: F401  registers our environments with Gymnasium

@@ -15,7 +15,7 @@ from pathlib import Path
 import pandas as pd
 from tqdm import tqdm
 
-from bcrl import probes
+from bcrl import compiling, probes
 from bcrl.composition import Composition, order_of
 from bcrl.envs import Env, check_tasks, is_simulated
 from bcrl.envs.car_on_hill import CarOnHill
@@ -24,6 +24,7 @@ from bcrl.envs.linear_system import LinearSystem
 from bcrl.envs.maze import Maze
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.evaluation import StepProbe
+from bcrl.files import seed_path, seeds_of
 from bcrl.learners.dqn import DQN
 from bcrl.learners.fqi import FQI
 from bcrl.learners.lspi import LSPI
@@ -131,6 +132,7 @@ def run(
     of docs/metrics.md (DQN). Seeds have the same results in any company. Raises
     BcrlError for seeds that diverge.
     """
+    compiling.check()
     seeds, target = _seeds(seeds), course[-1].env
     tasks = [*dict.fromkeys(s.env for s in course if s.env != target), target]
     if isinstance(course[-1].learner, FQI):
@@ -172,10 +174,10 @@ def _rows(now: Snapshot, probe: probes.Probe | StepProbe, seeds: Sequence[int]) 
 
 def read(folder: str | Path) -> pd.DataFrame:
     """The seeds that `bcrl` has recorded in a run's folder, as `run` gives them."""
-    files = sorted(Path(folder).glob("seed_*.csv"))
-    if not files:
+    numbers = seeds_of(Path(folder), "csv")
+    if not numbers:
         raise BcrlError(f"{folder}: there is no seed_*.csv")
-    found = {int(path.stem.removeprefix("seed_")): pd.read_csv(path) for path in files}
+    found = {n: pd.read_csv(seed_path(Path(folder), n, "csv")) for n in numbers}
     return (
         pd.concat(found, names=["seed", None])
         .reset_index("seed")

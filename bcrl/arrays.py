@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
+
+from bcrl.compiling import guvectorize
 
 
 def per_lane(signature: str, layout: str) -> Callable[[Callable], np.ufunc]:
@@ -18,7 +19,7 @@ def per_lane(signature: str, layout: str) -> Callable[[Callable], np.ufunc]:
     """
 
     def decorate(function: Callable) -> np.ufunc:
-        compiled = numba.guvectorize([signature], layout, cache=True)(function)
+        compiled = guvectorize([signature], layout, cache=True)(function)
         return compiled.ufunc
 
     return decorate

@@ -30,6 +30,10 @@ INTERPOLATION = re.compile(
     r"\$\{\s*(?:(?P<key>[^\s${}:,]+)"
     r"|(?P<resolver>oc\.env|now|hydra|python_version)\s*:(?P<value>[^${}]*))\s*\}"
 )
+#: Scalars of YAML 1.1 that are seldom meant: octal, hexadecimal, base 60, with `_`.
+TRUTH = re.compile("yes|no|on|off", re.IGNORECASE)
+ODD_NUMBER = re.compile(r"[+-]?(0[bx][\da-f_]+|\d[\d_]*(:[0-5]?\d)*)(\.[\d_]*)?", re.I)
+PLAIN = re.compile(r"[+-]?(0|[1-9]\d*)(\.\d*)?")
 Keys = tuple[Any, ...]  # keys and indices from the root of a config
 
 
@@ -98,6 +102,20 @@ def check_yaml(text: str) -> None:
         elif isinstance(event, yaml.ScalarEvent):
             add(1, 0)
             anchors[event.anchor] = (1, 0)
+            if event.implicit[0]:
+                _check_plain(event.value)
+
+
+def _check_plain(text: str) -> None:
+    """Raise BcrlError for a plain scalar that YAML 1.1 reads as one wouldn't think."""
+    if TRUTH.fullmatch(text):
+        why = "write true or false, or quote on and off where they are names"
+        raise BcrlError(f"has a bare {text}, a truth value to YAML; {why}")
+    if ODD_NUMBER.fullmatch(text) and not PLAIN.fullmatch(text):
+        if isinstance(read := yaml.safe_load(text), str):
+            return
+        why = "write the number that is meant in decimal digits, or quote a name"
+        raise BcrlError(f"has a bare {text}, which YAML reads as {read!r}; {why}")
 
 
 def check_interpolations(config: dict) -> None:
@@ -121,9 +139,11 @@ def check_interpolations(config: dict) -> None:
             height = max((each for _, each in inside), default=0)
         elif isinstance(node, str):
             size = 1 + len(node)
-            for resolved, chain in (
-                refer(path, found) for found in references(path, node)
-            ):
+            found = references(path, node)
+            if path[0] != "hydra" and any(map(_to_hydra, found)):
+                why = "Hydra's own keys are known in jobs only; write what is meant"
+                raise ConfigError(dotted(path), node, why)
+            for resolved, chain in (refer(path, each) for each in found):
                 size, height = size + resolved, max(height, 1 + chain)
         asked.pop()
         if height > CHAIN or size > RESOLVED:
@@ -150,11 +170,15 @@ def references(path: Keys, text: str) -> list[re.Match]:
         INTERPOLATION.match(text, each.start()) for each in re.finditer(r"\$\{", text)
     ]
     if None in found:
-        why = "only ${key}, ${oc.env:NAME}, ${now:…}, ${hydra:…}, not nested"
+        why = "only ${key}, ${oc.env:NAME} and ${now:…}, not nested"
         raise ConfigError(
             dotted(path), text, f"this interpolation isn't allowed: {why}"
         )
     return found
+
+
+def _to_hydra(found: re.Match) -> bool:
+    return found["resolver"] == "hydra" or (found["key"] or "").startswith("hydra.")
 
 
 def dotted(path: Keys) -> str:

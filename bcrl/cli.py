@@ -18,8 +18,8 @@ from bcrl import guard, shell
 from bcrl.composed import CONF, CONFIG_NAME
 from bcrl.errors import BcrlError
 from bcrl.files import make_directory
-from bcrl.interrupts import EXIT_CODE, Interrupted
-from bcrl.terminal import say, show
+from bcrl.interrupts import EXIT_CODE, Interrupted, heard
+from bcrl.terminal import ready, say, show
 
 if TYPE_CHECKING:
     from bcrl.compose import Plan
@@ -27,9 +27,13 @@ if TYPE_CHECKING:
 
 def main() -> None:
     """Console entry point; refuses bad input with one message before any work."""
+    ready()
     guard.register()
     try:
         with guard.refusals():
+            if not sys.argv[1:]:
+                show(shell.short())
+                sys.exit(2)
             arguments = shell.arguments()
             if arguments.help:
                 show(shell.manual(arguments.config_dir))
@@ -39,6 +43,7 @@ def main() -> None:
         if plans:
             from bcrl import runner
 
+            heard()
             runner.run(*plans)
     except BcrlError as error:
         sys.exit(_complain(error))
@@ -55,7 +60,7 @@ def _vet(arguments: Namespace) -> list[Plan]:
     if arguments.config_path:
         raise BcrlError("--config-path: add a folder of your own with --config-dir")
     if arguments.hydra_help or arguments.shell_completion:
-        _by_hydra()
+        _by_hydra(arguments)
         return []
     from bcrl import overview, records, vetting
 
@@ -70,13 +75,14 @@ def _vet(arguments: Namespace) -> list[Plan]:
         show(overview.dry_run(plans))
         return []
     if arguments.cfg or arguments.info:
-        _by_hydra()
+        _by_hydra(arguments)
         return []
     if vetting.left_to_hydra(arguments):
         from bcrl import launching, runner
 
         launching.register()
-        _by_hydra()
+        heard()
+        _by_hydra(arguments)
         runner.check_complete(plans)
         return []
     return plans
@@ -98,12 +104,21 @@ def _run_job(composed: DictConfig) -> int:
     return 0
 
 
-#: Not a decorator: a process of a launcher's looks for the plain function by its name.
-_by_hydra = hydra.main(
-    version_base="1.3", config_path=str(CONF), config_name=CONFIG_NAME
-)(_run_job)
+def _by_hydra(arguments: Namespace) -> None:
+    """Have Hydra do what is asked for, given the words in the order that it wants."""
+    sys.argv[1:] = [*arguments.flags, *arguments.overrides]
+    # Not a decorator: a launcher's process looks for the plain function by its name.
+    hydra.main(version_base="1.3", config_path=str(CONF), config_name=CONFIG_NAME)(
+        _run_job
+    )()
 
 
 def _complain(error: BcrlError) -> int:
     say(f"bcrl: {error}")
     return error.exit_code
+
+
+if __name__ == "__main__":
+    from bcrl.cli import main as command  # `_run_job` has to be found by its name
+
+    command()

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bcrl import probes
+from bcrl import compiling, probes
 from bcrl.algorithms import algorithm
 from bcrl.composition import Composition, composition
 from bcrl.config import Choice, Config, construct, one_of
@@ -78,6 +78,7 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
     the config departs from all of them, its results get a directory of their own, below
     the name of the `env` choice.
     """
+    compiling.check()
     _check_outputs(config)
     check_name("env", env)
     tasks, metrics = _tasks(config["env"])
@@ -93,7 +94,7 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
     same = [tag for tag, changed in differing.items() if not changed]
     tag = same[0] if same else _short_hash(differing[None])
     lockstep = config["seeds"]["lockstep"]
-    asked = tuple(config["seeds"]["first"] + i for i in range(config["seeds"]["count"]))
+    asked = _asked(config["seeds"])
     return Plan(
         env=env,
         variant=_variant(name, chosen),
@@ -108,6 +109,18 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
         device=_device(config["device"], chosen_algorithm.FAMILY),
         config=config,
     )
+
+
+def _asked(section: Plain) -> tuple[int, ...]:
+    """All seeds: so many from the first on, or those that are listed."""
+    first, count, listed = (section.get(key) for key in ("first", "count", "only"))
+    if count is not None:
+        return tuple(range(first, first + count))
+    if not listed or len(set(listed)) < len(listed):
+        raise ConfigError("seeds.only", listed, "must be different seeds: seeds=[3,7]")
+    for seed in listed:
+        at_least("seeds.only", seed, 0)
+    return tuple(sorted(listed))
 
 
 def part(seeds: tuple[int, ...], which: str | None) -> tuple[int, ...]:
@@ -182,7 +195,8 @@ def _check_outputs(config: Plain) -> None:
             check_name(key, value)
     for key, value, most in (
         ("seeds.first", seeds["first"], 2**32),
-        ("seeds.count", seeds["count"], 10**6),
+        ("seeds.count", seeds["count"] or len(seeds["only"] or ()), 10**6),
+        ("seeds.only", max(seeds["only"] or (0,)), 2**32),
     ):
         if value > most:
             raise ConfigError(key, value, f"must be at most {most}")

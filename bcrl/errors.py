@@ -54,7 +54,7 @@ def guess(word: str, known: Iterable[str]) -> str:
     return f"did you mean {close}?" if close else ""
 
 
-def closest(word: str, known: Iterable[str]) -> str | None:
+def closest(word: str, known: Iterable[str], like: float = 0.5) -> str | None:
     """The known word that is most like `word`, if one is like it at all."""
-    found = difflib.get_close_matches(word, sorted(known), n=1, cutoff=0.5)
+    found = difflib.get_close_matches(word, sorted(known), n=1, cutoff=like)
     return found[0] if found else None

@@ -55,6 +55,31 @@ def write_text(path: Path, text: str) -> Path:
     return write_atomically(path, lambda handle: handle.write(text.encode()))
 
 
+def seed_path(directory: Path, seed: int, suffix: str) -> Path:
+    """`seed_0007.csv` and its companions."""
+    return directory / f"seed_{seed:04d}.{suffix}"
+
+
+def seeds_of(directory: Path, suffix: str) -> list[int]:
+    """The seeds, by number, that a folder has files of; other files are passed over."""
+    stems = (path.stem.removeprefix("seed_") for path in directory.glob("seed_*"))
+    seeds = sorted({int(stem) for stem in stems if stem.isdecimal()})
+    return [seed for seed in seeds if seed_path(directory, seed, suffix).exists()]
+
+
+def user_folder(variable: str, usual: str) -> Path | None:
+    """A folder of the user's: XDG's `variable` if absolute, else `usual` at home.
+
+    None where no home is known: `~` never names a folder.
+    """
+    try:
+        chosen = Path(os.environ.get(variable, "")).expanduser()
+        folder = chosen if chosen.is_absolute() else Path.home() / usual
+    except RuntimeError:
+        return None
+    return folder if folder.is_absolute() else None
+
+
 def make_directory(directory: Path, key: str) -> None:
     """Make a folder and those above it; BcrlError names `key` if that can't be done."""
     try:

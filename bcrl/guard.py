@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +21,20 @@ from hydra.core.object_type import ObjectType
 from hydra.core.plugins import Plugins
 from hydra.errors import CompactHydraException
 from hydra.plugins.config_source import ConfigResult
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from bcrl import bounds, config, safety
 from bcrl.errors import BcrlError
+from bcrl.identity import flat
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
+STARTED = "BCRL_STARTED"  # when the command began, in its jobs' processes, too
+
+
+def now(pattern: str) -> str:
+    """`${now:%H-%M}`: when the command began, one time in all of its jobs."""
+    began = float(os.environ.setdefault(STARTED, str(time.time())))
+    return datetime.fromtimestamp(began).strftime(pattern)
 
 
 class Refused(BcrlError, CompactHydraException):
@@ -38,9 +48,26 @@ class Files(FileConfigSource):
         name = os.path.normpath(self._normalize_file_name(config_path))
         if os.path.isabs(name) or name.startswith(".."):
             raise Refused(f"{config_path}: leads out of the folder {self.path}")
-        if self.provider != "main":
-            bounds.check_file(Path(self.path, name))
-        return super().load_config(config_path)
+        if self.provider == "main":
+            return super().load_config(config_path)
+        bounds.check_file(Path(self.path, name))
+        loaded = super().load_config(config_path)
+        package = loaded.header.get("package") or os.path.dirname(name)
+        if package in ("", "_global_"):
+            config.seeds_of(loaded.config)
+        _check_texts(package, loaded.config)
+        return loaded
+
+
+def _check_texts(package: str, loaded: Any) -> None:
+    """Raise Refused where a file has a number for what is text: `tag: 1e3`."""
+    if not isinstance(loaded, DictConfig):
+        return
+    place = "" if package == "_global_" else package.replace("/", ".") + "."
+    for key, value in flat(OmegaConf.to_container(loaded, resolve=False)).items():
+        name = f"{place}{key}".lstrip(".")
+        if isinstance(value, (int, float)) and name in config.texts():
+            raise Refused(f"{name}={value}: quote it where it is a name")
 
 
 class Packages(ImportlibResourcesConfigSource):
@@ -63,6 +90,7 @@ class Loader(ConfigLoaderImpl):
         self._repositories: dict[tuple, Any] = {}
 
     def load_configuration(self, *args: Any, **kwargs: Any) -> DictConfig:
+        OmegaConf.register_new_resolver("now", now, replace=True)
         composed = super().load_configuration(*args, **kwargs)
         try:
             safety.check(composed)

@@ -19,6 +19,12 @@ SIGNALS += (signal.SIGUSR1, signal.SIGUSR2)
 EXIT_CODE = 75  # EX_TEMPFAIL: nothing is wrong, run the same command again
 
 
+def heard() -> None:
+    """From now on Ctrl-C is an exception, no end without a word."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 class Interrupted(BaseException):
     """A signal has ended the work; what was done is kept."""
 

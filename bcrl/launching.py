@@ -8,6 +8,7 @@ back what had to leave. What has become of the seeds is read from their files, n
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -27,13 +28,21 @@ from hydra_plugins.hydra_submitit_launcher.submitit_launcher import SlurmLaunche
 from omegaconf import DictConfig
 
 from bcrl import compose, guard, records, vetting
-from bcrl.errors import ConfigError
+from bcrl.errors import BcrlError, ConfigError
 from bcrl.interrupts import EXIT_CODE, Interrupted, Stop
 from bcrl.terminal import say
 from bcrl.workers import cores
 
+COMMANDS = ("sbatch", "srun", "squeue")  # of Slurm's, that have to be here
+PATIENCE = 1800.0  # seconds that squeue may fail, as while Slurm restarts
 ARRAY = 1000  # jobs of one array: Slurm's MaxArraySize is 1001 unless a site says more
 Jobs = Sequence[Sequence[str]]  # each one's overrides
+
+
+class Unattended(BcrlError):
+    """Slurm has jobs of this command, which ends before them."""
+
+    exit_code = 3
 
 
 class Local(JoblibLauncher):
@@ -104,6 +113,9 @@ class Slurm(SlurmLauncher):
     def launch(self, job_overrides: Jobs, initial_job_idx: int) -> Sequence:
         import submitit  # late, as the plugin does: a second
 
+        if missing := [name for name in COMMANDS if not shutil.which(name)]:
+            why = f"there is no {', '.join(missing)} here: run it on a login node"
+            raise ConfigError("hydra/launcher", "slurm", why)
         jobs = _divided(self, job_overrides, self.seeds_per_job)
         params = {f"slurm_{key}": value for key, value in self.params.items()}
         folder = params.pop("slurm_submitit_folder")
@@ -119,15 +131,23 @@ class Slurm(SlurmLauncher):
         with guard.unregistered():
             state = Singleton.get_state()
         rows = [(job, "hydra.sweep.dir", n, "", state) for n, job in enumerate(jobs)]
-        arrays, stop = [], Stop()
+        arrays: list[str] = []
+        stop = Stop()
         with stop.on_signals(second_ends_all=True):
             for first in range(0, len(rows), ARRAY):
-                columns = zip(*rows[first : first + ARRAY], strict=True)
-                submitted = executor.map_array(self, *columns)
+                some = rows[first : first + ARRAY]
+                try:
+                    submitted = executor.map_array(self, *zip(*some, strict=True))
+                except (RuntimeError, OSError) as error:
+                    if stop.asked:  # Ctrl-C ends a hanging sbatch, too
+                        break
+                    raise _refused(error, arrays, first, len(rows)) from error
                 arrays.append(submitted[0].job_id.partition("_")[0])
-            if arrays:
-                count = f"{len(jobs)} job{'s' * (len(jobs) > 1)}"
-                say(f"Slurm: {count} as {' '.join(arrays)}; logs in {folder}")
+                count = f"{len(some)} job{'s' * (len(some) > 1)}"
+                say(f"Slurm: {count} as {arrays[-1]}; logs in {folder}")
+                if stop.asked:
+                    break
+            if arrays or stop.asked:
                 _wait(arrays, self.config.progress != "none", stop)
         return []
 
@@ -139,7 +159,8 @@ class Slurm(SlurmLauncher):
             code = super().__call__(*arguments).return_value
         except Interrupted:
             own = f"--jobs={os.environ['SLURM_JOB_ID']}"
-            now = _squeue(own, "--format=%T %r") or ""
+            now, _ = _squeue(own, "--format=%T %r")
+            now = now or ""
             # Not where somebody has ended it, or Slurm puts it back by itself.
             if now.startswith("RUNNING") or now.endswith("TimeLimit"):
                 usual = f"SIG{submitit.JobEnvironment.USR_SIG}"
@@ -148,12 +169,33 @@ class Slurm(SlurmLauncher):
         sys.exit(code)  # nobody waits for a result
 
 
+def _refused(error: Exception, arrays: Sequence[str], taken: int, n: int) -> BcrlError:
+    """What to say if sbatch fails, perhaps after some arrays were submitted."""
+    words = " ".join(str(error).split())
+    if not arrays:
+        return BcrlError(f"Slurm refuses the jobs, none was submitted: {words}")
+    return Unattended(
+        f"Slurm took {taken} of {n} jobs, as {' '.join(arrays)}, and refuses the rest: "
+        f"{words}\n`scancel {' '.join(arrays)}` ends them; once they are over, the "
+        "same command submits what isn't complete then"
+    )
+
+
 def _wait(arrays: Sequence[str], telling: bool, stop: Stop) -> None:
     """Until none of the arrays has a job waiting or running; a signal interrupts."""
-    pause, before = 1.0, ""
+    pause, before, answered = 1.0, "", time.monotonic()
     while not stop.asked:
-        listed = _squeue("--me", "--array", "--format=%F %T")
-        if listed is not None:
+        listed, why = _squeue("--me", "--array", "--format=%F %T")
+        if listed is None:
+            if before != why:
+                say(f"Slurm: squeue fails, it is asked again: {why}")
+            pause, before = min(30.0, 1.2 * pause), why
+            if time.monotonic() > answered + PATIENCE:
+                text = f"squeue has failed for {PATIENCE / 60:.0f} minutes: {why}"
+                more = f"what it had of {' '.join(arrays)} may run on (--status tells)"
+                raise Unattended(f"{text}; {more}")
+        else:
+            answered = time.monotonic()
             jobs = [line.split() for line in listed.splitlines()]
             states = Counter(state for array, state in jobs if array in arrays)
             if not states:
@@ -164,15 +206,23 @@ def _wait(arrays: Sequence[str], telling: bool, stop: Stop) -> None:
                 say(f"Slurm: {now}")
             before = now
         time.sleep(pause)
-    say(f"bcrl: Slurm goes on with it; `scancel {' '.join(arrays)}` ends it")
+    if arrays:
+        say(f"bcrl: Slurm goes on with it; `scancel {' '.join(arrays)}` ends it")
     raise Interrupted
 
 
-def _squeue(*options: str) -> str | None:
-    """What Slurm's queue says; None if it can't be asked, as while Slurm restarts."""
+def _squeue(*options: str) -> tuple[str | None, str]:
+    """What Slurm's queue says, or None and why it doesn't, as while Slurm restarts."""
     command = ["squeue", "--noheader", *options]
-    done = subprocess.run(command, capture_output=True, text=True)
-    return done.stdout.strip() if done.returncode == 0 else None
+    try:
+        done = subprocess.run(
+            command, capture_output=True, encoding="utf-8", errors="replace", timeout=60
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return None, str(error)
+    if done.returncode:
+        return None, " ".join(done.stderr.split()) or f"exit code {done.returncode}"
+    return done.stdout.strip(), ""
 
 
 def _count(key: str, value: object) -> int | None:

@@ -80,7 +80,7 @@ class Lock:
     def holder(self) -> str:
         """Who says to hold it."""
         try:
-            return self.path.read_text(errors="replace") or "another process"
+            return self.path.read_text("utf-8", "replace") or "another process"
         except OSError:
             return "another process"
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bcrl import checkpoints, costs, locks, records, runner, vetting
+from bcrl import checkpoints, costs, files, locks, records, runner, vetting
 from bcrl.compose import Plan
 from bcrl.errors import BcrlError
 from bcrl.progress import named
@@ -44,7 +44,8 @@ def dry_run(plans: Sequence[Plan]) -> str:
     wall = _minutes(_wall(seconds, workers))
     total = f"{len(work)} jobs, about {_minutes(sum(seconds))} core minutes"
     last = f"{total}, {wall} min with workers={workers}; nothing was run or written"
-    return "\n".join([*_aligned(rows), *hopeless, last])
+    damaged = [x for plan in plans for x in runner.damage(plan.directory, plan.seeds)]
+    return "\n".join([*_aligned(rows), *damaged, *hopeless, last])
 
 
 def _wall(seconds: Sequence[float], workers: int) -> float:
@@ -102,12 +103,9 @@ def status(arguments: Namespace) -> str:
 def _ever_asked(directory: Path) -> list[int]:
     """The seeds that a variant's folder was ever asked for, by what those begun say."""
     seeds: set[int] = set()
-    for path in directory.glob("seed_*.json"):
-        number = path.stem.partition("_")[2]
-        if not number.isdecimal():
-            continue  # somebody else's; bcrl-verify tells
+    for number in files.seeds_of(directory, "json"):
         try:
-            for first, last in records.read_facts(directory, int(number))["asked"]:
+            for first, last in records.read_facts(directory, number)["asked"]:
                 seeds.update(range(first, min(last, first + MOST) + 1))
         except records.MALFORMED:
             continue
@@ -143,10 +141,11 @@ def _state(directory: Path, seed: int, facts: Mapping[str, Any]) -> str:
 
 
 def _reasons(asked: Asked) -> Iterator[str]:
-    """A line for each reason why seeds have failed."""
+    """A line for each reason why seeds have failed, or count no more."""
     for why in dict.fromkeys(asked.failed.values()):
         lost = [seed for seed, reason in asked.failed.items() if reason == why]
         yield f"{asked.name}, {named(lost)}: {why}"
+    yield from runner.damage(asked.directory, list(asked.states))
 
 
 def _minutes(seconds: float) -> str:

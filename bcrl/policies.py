@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.arrays import per_lane
+from bcrl.compiling import kept
 
 TIE = 1e-9  # distances between actions that differ by less are equal
 
@@ -67,7 +68,7 @@ def combined(actions: NDArray[np.float64]) -> NDArray[np.intp]:
     return np.where(np.linalg.norm(aim, axis=-1) < TIE, own, table)
 
 
-@numba.njit(cache=True, nogil=True)
+@kept(nogil=True)
 def walk(next_row, reward, absorbing, q, first, u, epsilon):
     """One seed's ε-greedy episodes in a finite task, row by row from `first` (E,).
 

@@ -54,7 +54,12 @@ class Progress:
         self.began = time.monotonic()
         self._shown = (0.0, self.began)  # share and time of the last line
         shape = "{desc} |{bar}| {percentage:3.0f}% {elapsed}{postfix}"
-        self.bar = tqdm(total=1.0, bar_format=shape) if mode == "bar" else None
+        self.bar = None
+        if mode == "bar":
+            try:
+                self.bar = tqdm(total=1.0, bar_format=shape)
+            except (ValueError, TypeError):  # a TQDM_* variable that tqdm can't read
+                self.mode = "lines"
 
     def tick(self, tick: Tick) -> None:
         """Note how far a job is, and show it."""

@@ -6,9 +6,11 @@ import io
 import json
 import os
 import platform
+import shlex
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,10 +21,20 @@ from numpy.typing import NDArray
 
 from bcrl import __version__
 from bcrl.compose import Plan
+from bcrl.divergence import diverging
 from bcrl.errors import BcrlError
-from bcrl.files import make_directory, sealed, sha256, write_atomically, write_text
+from bcrl.files import (
+    is_intact,
+    make_directory,
+    sealed,
+    seed_path,
+    sha256,
+    write_atomically,
+    write_text,
+)
 from bcrl.identity import Plain, differences, identity
 from bcrl.locks import waited_for
+from bcrl.progress import named
 
 SCHEMA = 2  # raised when a file's meaning changes
 MALFORMED = (ValueError, LookupError, TypeError, AttributeError)  # what a file may be
@@ -41,7 +53,7 @@ def check_directory(plan: Plan) -> None:
     if not present.exists():
         return
     try:
-        before = yaml.safe_load(present.read_text())
+        before = yaml.safe_load(present.read_text("utf-8"))
         changed = differences(before, plan.config)
     except (yaml.YAMLError, OSError, *MALFORMED) as error:
         raise BcrlError(f"{present} can't be read ({error}); move it away") from error
@@ -70,17 +82,53 @@ def begin(plan: Plan) -> None:
             write_text(directory / "config.yaml", text)
 
 
-def seed_path(directory: Path, seed: int, suffix: str) -> Path:
-    """`seed_0007.csv` and its companions."""
-    return directory / f"seed_{seed:04d}.{suffix}"
-
-
 def is_complete(directory: Path, seed: int) -> bool:
-    """Whether this seed's metadata, written last, says that all of it is there."""
+    """Whether a seed's JSON, written last, says so, and its files are unchanged."""
+    return _look(directory, seed)[0]
+
+
+def damaged(directory: Path, seeds: Sequence[int]) -> dict[int, str]:
+    """Seeds with files of a finished run that can't count any more, and why not."""
+    looks = {seed: _look(directory, seed)[1] for seed in seeds}
+    return {seed: why for seed, why in looks.items() if why}
+
+
+def _look(directory: Path, seed: int) -> tuple[bool, str]:
+    stamps = []
+    for suffix in ("json", "csv", "npz"):
+        try:
+            about = seed_path(directory, seed, suffix).stat()
+            stamps.append((about.st_ino, about.st_size, about.st_ctime_ns))
+        except OSError:
+            stamps.append(None)
+    return _checked(directory, seed, *stamps)
+
+
+@lru_cache(maxsize=2**16)
+def _checked(directory: Path, seed: int, *stamps: object) -> tuple[bool, str]:
+    """Whether a seed is complete, and what is wrong with what a finished run left.
+
+    The files are read once for each of their states, which `stamps` tells apart.
+    """
+    if stamps[0] is None:
+        return False, "the JSON is missing" if any(stamps) else ""
     facts = read_facts(directory, seed)
-    complete = (facts.get("status"), facts.get("schema")) == ("complete", SCHEMA)
-    files = [seed_path(directory, seed, suffix) for suffix in ("csv", "npz")]
-    return complete and all(file.exists() for file in files)
+    if not facts or not is_intact(facts):
+        return False, "the JSON was changed or damaged after it was written"
+    if facts.get("schema") != SCHEMA or facts.get("status") != "complete":
+        return False, ""
+    name = "@".join(filter(None, (facts.get("variant"), facts.get("tag"))))
+    home = facts.get("scale"), facts.get("env"), name
+    if (facts.get("seed"), *home) != (seed, *directory.parts[-3:]):
+        return False, "the JSON is another run's"
+    for suffix in ("csv", "npz"):
+        try:
+            data = seed_path(directory, seed, suffix).read_bytes()
+        except OSError as error:
+            return False, f"the {suffix.upper()} can't be read ({error.strerror})"
+        if sha256(data) != facts.get("sha256", {}).get(suffix):
+            return False, f"the {suffix.upper()} was changed after it was written"
+    return True, ""
 
 
 def status(plan: Plan, seed: int) -> str | None:
@@ -140,7 +188,27 @@ def write_seed(
         path = seed_path(plan.directory, seed, suffix)
         write_atomically(path, lambda file, data=data: file.write(data))
     hashes = {suffix: sha256(data) for suffix, data in contents.items()}
-    write_status(plan, seed, status, {"sha256": hashes} | facts)
+    columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    found = {"sha256": hashes, "diverging": diverging(columns)}
+    write_status(plan, seed, status, found | facts)
+
+
+def diverged(plan: Plan) -> str | None:
+    """A sentence about the plan's seeds whose values diverge, or None."""
+    facts = {seed: read_facts(plan.directory, seed) for seed in plan.seeds}
+    lost = {
+        seed: fact["diverging"] for seed, fact in facts.items() if fact.get("diverging")
+    }
+    largest: dict[str, float] = {}
+    for values in lost.values():
+        for name, value in values.items():
+            largest[name] = max(value, largest.get(name, 0.0))
+    which = ", ".join(f"{name} up to {value:.3g}" for name, value in largest.items())
+    return (
+        f"{plan.env} {plan.name}, {named(list(lost))}: diverges, {which}"
+        if lost
+        else None
+    )
 
 
 def closing_table(plans: Sequence[Plan], seconds: float) -> str:
@@ -172,8 +240,8 @@ def closing_table(plans: Sequence[Plan], seconds: float) -> str:
 def read_facts(directory: Path, seed: int) -> Plain:
     """A seed's metadata, nothing if it has none."""
     try:
-        facts = json.loads(seed_path(directory, seed, "json").read_text())
-    except (OSError, ValueError):
+        facts = json.loads(seed_path(directory, seed, "json").read_text("utf-8"))
+    except (OSError, ValueError, RecursionError):
         return {}
     return facts if isinstance(facts, dict) else {}
 
@@ -181,7 +249,7 @@ def read_facts(directory: Path, seed: int) -> Plain:
 def provenance() -> dict[str, Any]:
     """Versions, git revision and machine."""
     return {
-        "command": " ".join(sys.argv),
+        "command": _typed(sys.argv),
         "versions": {
             "bcrl": __version__,
             "python": platform.python_version(),
@@ -194,6 +262,12 @@ def provenance() -> dict[str, Any]:
             "cores": os.cpu_count(),
         },
     }
+
+
+def _typed(words: Sequence[str]) -> str:
+    """A command line that can be pasted; the program without its folder."""
+    program, *rest = words
+    return shlex.join([Path(program).name, *rest])
 
 
 def _revision() -> dict[str, Any]:
@@ -214,7 +288,8 @@ def _git(*arguments: str) -> str | None:
         done = subprocess.run(
             ["git", "-C", str(here), *arguments],
             capture_output=True,
-            text=True,
+            encoding="utf-8",
+            errors="replace",
             timeout=10,
         )
     except (OSError, subprocess.TimeoutExpired):
@@ -224,7 +299,7 @@ def _git(*arguments: str) -> str | None:
 
 def _processor() -> str:
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
     except OSError:
         return platform.processor()
     names = (line.split(":", 1)[1].strip() for line in lines if "model name" in line)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from bcrl.compiling import kept
 from bcrl.pack import storable
 
 
@@ -117,7 +117,7 @@ class Replay:
         )
 
 
-@numba.njit(cache=True)
+@kept
 def _pack(rows, at, state, next_state, next_base, fixed, discount, action):
     """Row `at` of every seed: state, next state, next base, c, discount, action."""
     d, n_actions = state.shape[1], next_base.shape[1]

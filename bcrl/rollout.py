@@ -109,7 +109,7 @@ def rollout(
         if exploit.any():  # Q may be dear: ask it only where it decides
             asked = [x[lanes] for x, lanes in zip(now, exploit, strict=True)]
             values, lost = ask(q, asked, env.n_actions)
-            failed.update(lost)
+            failed.update(lost | failed)
             act[exploit] = greedy(np.concatenate(values), u[..., 1][exploit])
         return act
 

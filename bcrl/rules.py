@@ -179,7 +179,7 @@ def _check_lspi(chosen: Composition, slot: int, learner: LSPI, start: Start) -> 
     if not 0 < learner.noise_std < math.inf:
         why = "must be above 0: without noise LSTDQ sees one action per state"
         raise ConfigError("algorithm.lspi.noise_std", learner.noise_std, why)
-    learner.episodes(env)  # which says whether they are whole
+    learner.episodes_per_iteration(env)  # says whether they are whole
 
 
 def _check_numbers(section: str, learner: FQI | DQN | LSPI) -> None:

@@ -10,7 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from bcrl import checkpoints, costs, locks, oracle, progress, records, training
+from bcrl import (
+    checkpoints,
+    compiling,
+    costs,
+    locks,
+    oracle,
+    progress,
+    records,
+    training,
+)
 from bcrl.compose import Plan
 from bcrl.envs import Env
 from bcrl.errors import BcrlError
@@ -48,6 +57,8 @@ def run(*plans: Plan) -> None:
     began, options = time.perf_counter(), plans[0].config
     plans, stop = tuple(merged(plans)), Stop()
     failed: Failures = {}
+    if options["progress"] != "none" and (why := compiling.why_uncached()):
+        say(why)
     with stop.on_signals(second_ends_all=True):
         for plan in plans:
             _look_round(plan)
@@ -57,6 +68,9 @@ def run(*plans: Plan) -> None:
                 _wait(busy, options["progress"], stop)
     if work:
         raise Interrupted
+    if options["progress"] != "none":
+        for note in filter(None, map(records.diverged, plans)):
+            say(note)
     if len(plans) > 1 and options["progress"] != "none":
         spent = time.perf_counter() - began
         say(records.closing_table(plans, spent))
@@ -124,7 +138,8 @@ def check_complete(plans: Sequence[Plan]) -> None:
 
 def _undone(plan: Plan, seed: int) -> str:
     """Why a seed isn't complete, as far as its files tell."""
-    status = records.status(plan, seed) or "never begun"
+    why = records.damaged(plan.directory, [seed]).get(seed)
+    status = why or records.status(plan, seed) or "never begun"
     if status == "running":
         return "begun, but its process is gone or was told to leave"
     return status.removeprefix("failed: ")
@@ -139,10 +154,21 @@ def _look_round(plan: Plan) -> None:
         few = "seeds.lockstep=1, fewer episodes, a smaller replay or observations"
         sizes = f"up to {needed / 2**30:.1f} GiB of memory, of {there / 2**30:.1f} GiB"
         say(f"{plan.env} {plan.name}: the data of a team take {sizes}; {few} take less")
+    for line in damage(plan.directory, plan.seeds):
+        say(f"bcrl: {line}")
     done = len(plan.seeds) - len(records.pending(plan))
     if done and plan.config["progress"] != "none":
         said = f"{done} of {len(plan.seeds)} seeds complete"
         say(f"{plan.env} {plan.name}: {said}")
+
+
+def damage(directory: Path, seeds: Sequence[int]) -> Iterator[str]:
+    """A line for each way in which files of finished seeds are damaged."""
+    found = records.damaged(directory, seeds)
+    for why in dict.fromkeys(found.values()):
+        lost = [seed for seed, reason in found.items() if reason == why]
+        name = f"{' '.join(directory.parts[-3:])}, {progress.named(lost)}"
+        yield f"{name}: {why}; a rerun makes {'them' if lost[1:] else 'it'} again"
 
 
 def _groups(seeds: list[int], lockstep: int, workers: int) -> list[Seeds]:

@@ -82,6 +82,9 @@ def check(composed: DictConfig) -> None:
     for section in LOGGING:
         _check_logging(f"hydra.{section}", hydra.get(section))
     job = hydra.get("job") or {}
+    if job.get("chdir"):
+        why = "results and checkpoints are in runs_dir, wherever a job is: chdir=false"
+        raise ConfigError("hydra.job.chdir", job["chdir"], why)
     for key in ("env_set", "env_copy"):
         for name in job.get(key) or ():
             if not HARMLESS.fullmatch(str(name)):

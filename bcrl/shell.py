@@ -6,67 +6,125 @@ import argparse
 import os
 import sys
 import textwrap
-import time
 from argparse import Namespace
-from contextlib import redirect_stderr
+from collections.abc import Sequence
 from pathlib import Path
 from string import Template
+from typing import NoReturn
 
 from hydra._internal.utils import get_args_parser
 
+from bcrl import __version__
 from bcrl.composed import CONF, PACKAGE
-from bcrl.errors import BcrlError, guess
+from bcrl.errors import BcrlError, closest, guess
+from bcrl.files import user_folder
 
 HELP = PACKAGE / "help.txt"
 WIDTH, HANGING = 88, 21  # columns of the help, and where an option's text begins
-STARTED = "BCRL_STARTED"  # when the command began: a debug run's folder
 LINE = "COMP_LINE"  # the environment variable with the line that Tab is to complete
 
 
 def arguments() -> Namespace:
     """What the command line asks for; BcrlError for a flag that there isn't.
 
-    `sys.argv` is put into the order that Hydra wants, flags first; people write them
-    anywhere. A folder of configs that isn't named is the user's own, if there is one.
+    Its `flags` are all words but the overrides. A folder of configs that isn't named is
+    the user's own, if there is one.
     """
-    os.environ.setdefault(STARTED, time.strftime("%Y-%m-%d_%H-%M-%S"))
-    flags = parser()
-    asked, unknown = flags.parse_known_intermixed_args()
-    if unknown:
-        close = guess(unknown[0].partition("=")[0], _names(flags))
-        raise BcrlError(f"{unknown[0]}: unknown flag; {close or 'see bcrl --help'}")
-    given = [word for word in sys.argv[1:] if word not in asked.overrides]
+    flags, words = parser(), sys.argv[1:]
+    for place, word in enumerate(words):
+        if word == "--":
+            break
+        if word.startswith("-") and not _is_flag(word, flags):
+            raise BcrlError(f"{word}: unknown flag; {_meant(words, place, flags)}")
+    asked = flags.parse_intermixed_args()
+    if asked.runs_dir is not None:
+        quoted = asked.runs_dir.replace('"', r"\"")
+        asked.overrides.append(f'runs_dir="{quoted}"')
+    asked.flags = _without(sys.argv[1:], asked)
     folder = asked.config_dir
     if asked.shell_completion:
         folder = _completed(flags).config_dir
-    if folder is None and own_folder().is_dir():
-        folder = str(own_folder())
-    if folder != asked.config_dir:
-        given.append(f"--config-dir={folder}")
+    if folder is None and (own := own_folder()):
+        folder = str(own)
+    if folder is not None:  # a launcher's process may be in another
+        folder = os.path.abspath(folder)
+        asked.flags.append(f"--config-dir={folder}")
     asked.config_dir = folder
-    sys.argv[1:] = given + asked.overrides
     return asked
+
+
+def _is_flag(word: str, flags: argparse.ArgumentParser) -> bool:
+    """Whether a word is a flag, may be abbreviated and with its value."""
+    name = word.partition("=")[0]
+    known = [each for action in flags._actions for each in action.option_strings]
+    short = [each for each in known if len(each) <= 3 and each[:2] != "--"]
+    return name in known or (
+        any(each.startswith(name) for each in known)
+        if name.startswith("--")
+        else all(f"-{letter}" in short for letter in name[1:]) and len(name) > 1
+    )
+
+
+def _meant(words: Sequence[str], place: int, flags: argparse.ArgumentParser) -> str:
+    """What a flag that there isn't probably means."""
+    from bcrl.hints import Hints
+
+    word, after = words[place], words[place + 1 : place + 2]
+    value = after[0] if after and "=" not in after[0] and after[0][0] != "-" else None
+    chosen = tuple(each for each in words if "=" in each and not each.startswith("-"))
+    near = closest(word.partition("=")[0], _names(flags), 0.7)
+    line = near or Hints(chosen).words(word, value) or guess(word, _names(flags))
+    return f"did you mean {line}?" if line else "see bcrl --help"
+
+
+def _without(words: Sequence[str], asked: Namespace) -> list[str]:
+    """The words that are Hydra's flags: no overrides, and not the results' folder."""
+    kept, ours = [], False
+    for word in words:
+        if (
+            not ours
+            and word not in asked.overrides
+            and not word.startswith("--runs-dir")
+        ):
+            kept.append(word)
+        ours = word == "--runs-dir"
+    return kept
 
 
 def parser() -> argparse.ArgumentParser:
     """Hydra's flags and ours."""
     result = get_args_parser()
     result.prog = "bcrl"
+    shown = next(a for a in result._actions if "--version" in a.option_strings)
+    shown.version, shown.help = f"bcrl {__version__}", "show bcrl's version"
     result.add_argument("--dry-run", action="store_true", help="list jobs and costs")
+    result.add_argument("--runs-dir", metavar="PATH", help="as runs_dir=PATH")
+    result.error = _refuse
     result.add_argument("--status", action="store_true", help="list what is done")
     return result
 
 
-def own_folder() -> Path:
-    """The user's folder of configs, which need not be there: ~/.config/bcrl."""
-    base = os.environ.get("XDG_CONFIG_HOME") or os.path.expanduser("~/.config")
-    return Path(base, "bcrl")
+def _refuse(message: str) -> NoReturn:
+    raise BcrlError(f"{message}; see bcrl --help")
+
+
+def short() -> str:
+    """What `bcrl` alone shows: what it is, examples, and where more is said."""
+    title, _, rest = manual(None).partition("\n")
+    examples = rest.partition("\nExamples\n")[2].partition("\n\n")[0]
+    return f"{title}\n\n{examples}\n\nbcrl --help shows groups, keys, flags and more."
+
+
+def own_folder() -> Path | None:
+    """The user's folder of configs, ~/.config/bcrl, if it is there."""
+    base = user_folder("XDG_CONFIG_HOME", ".config")
+    return base / "bcrl" if base and (base / "bcrl").is_dir() else None
 
 
 def manual(config_dir: str | None) -> str:
     """The help, with the options of every group, those of a folder of one's own too."""
     folders = [CONF, *([Path(config_dir)] if config_dir else [])]
-    text = Template(HELP.read_text())
+    text = Template(HELP.read_text("utf-8"))
     options = {
         name: ", ".join(_options(folders, name.replace("__", "/")))
         for name in text.get_identifiers()
@@ -93,9 +151,8 @@ def _completed(flags: argparse.ArgumentParser) -> Namespace:
         print(*(name for name in _names(flags) if name.startswith(words[-1])))
         sys.exit(0)
     try:
-        with open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):
-            typed, _ = flags.parse_known_intermixed_args(words)
-    except SystemExit:  # a flag's own argument is missing: the shell proposes files
+        typed, _ = flags.parse_known_intermixed_args(words)
+    except BcrlError:  # a flag's own argument is missing: the shell proposes files
         sys.exit(0)
     chosen = any(o.startswith(("env=", "experiment=")) for o in typed.overrides)
     # Without an env nothing composes; most keys are the same in all of them.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from argparse import Namespace
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,10 +15,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bcrl import compose, safety
 from bcrl.compose import Plan
-from bcrl.composed import CONF, CONFIG_NAME, Folders, composed
-from bcrl.errors import BcrlError, did_you_mean, guess
+from bcrl.composed import CONF, CONFIG_NAME, Folders, Unknown, composed
+from bcrl.config import check_launcher
+from bcrl.errors import BcrlError, ConfigError, guess
+from bcrl.hints import Hints
 from bcrl.identity import Plain, differences
 from bcrl.sweeps import experiments, first_lines, over_experiments, parse, product
+from bcrl.typed import canonical, options
 
 #: The choices that make a variant; a run is compared with these at their defaults.
 VARIANT_GROUPS = ("env", "algorithm", "curriculum", "boosting", "transfer", "scale")
@@ -42,6 +45,8 @@ RUNNING = (
 def plans(arguments: Namespace) -> list[Plan]:
     """The checked plan of each job that this command line asks for."""
     folders, jobs = _composed(arguments)
+    for job in jobs:
+        check_launcher(job.hydra.launcher)
     planned = [plan(job, job.hydra, folders) for job in jobs]
     _refuse_collisions(planned)
     return planned
@@ -95,9 +100,11 @@ def _running(job: DictConfig) -> Plain:
 
 
 def _composed(arguments: Namespace) -> tuple[Folders, list[DictConfig]]:
-    """The folders of configs besides ours, and each job composed."""
+    """The folders of configs besides ours, and each job composed.
+
+    The arguments' overrides are canonical then.
+    """
     name = arguments.config_name or CONFIG_NAME
-    parsed = parse(arguments.overrides)
     folders: Folders = ()
     if arguments.config_dir:
         folder = Path(arguments.config_dir).absolute()
@@ -106,17 +113,24 @@ def _composed(arguments: Namespace) -> tuple[Folders, list[DictConfig]]:
             text = f"--config-dir: there is no folder {folder}"
             raise BcrlError(f"{text}; {close}" if close else text)
         folders = (str(folder),)
+    hints = Hints(tuple(arguments.overrides), folders)
+    hints.check()
+    arguments.overrides = canonical(arguments.overrides, folders)
+    parsed = parse(arguments.overrides)
     searchpath = [o for o in parsed if o.key_or_group == "hydra.searchpath"]
     parsed = [o for o in parsed if o not in searchpath]
     for override in searchpath:
         folders += _folders(override.value())
-    _refuse_nonsense(parsed, folders, arguments)
+    _refuse_nonsense(parsed, hints, arguments)
     multirun = bool(arguments.multirun)
-    return folders, [
-        composed(name, tuple(job), folders)
-        for overrides in experiments(parsed, multirun)
-        for job in _jobs(name, overrides, multirun, folders)
-    ]
+    try:
+        return folders, [
+            composed(name, tuple(job), folders)
+            for overrides in experiments(parsed, multirun)
+            for job in _jobs(name, overrides, multirun, folders)
+        ]
+    except Unknown as error:
+        raise BcrlError(hints.explained(error)) from error
 
 
 def _folders(searchpath: object) -> Folders:
@@ -130,7 +144,7 @@ def _folders(searchpath: object) -> Folders:
 
 
 def _refuse_nonsense(
-    overrides: Sequence[Override], folders: Folders, arguments: Namespace
+    overrides: Sequence[Override], hints: Hints, arguments: Namespace
 ) -> None:
     """Raise BcrlError for what Hydra would take without a word, or trip over."""
     asked = [o.get_key_element() for o in overrides if o.key_or_group[:5] == "hydra"]
@@ -145,8 +159,8 @@ def _refuse_nonsense(
         value = override.value()
         named = isinstance(value, (str, Sweep))
         if key in (*VARIANT_GROUPS, *OPTIONAL, "variant") and not named:
-            text = f"{override.input_line}: name an option, or leave {key} out"
-            raise BcrlError(text)
+            why = f"name an option, or leave {key} out; {hints.of_option(key, value)}"
+            raise BcrlError(f"{override.input_line}: {why}")
         group = key.replace(".", "/")
         if group != key and isinstance(value, str) and Path(CONF, group).is_dir():
             text = f"{override.input_line}: an option is chosen by {group}={value}"
@@ -155,20 +169,12 @@ def _refuse_nonsense(
             raise BcrlError("experiment: one at a time, or -m experiment=fig1,fig2")
         if key in OPTIONAL:
             swept = override.is_sweep_override()
-            _check_options(
-                key, override.sweep_string_iterator() if swept else [value], folders
-            )
+            names = override.sweep_string_iterator() if swept else [value]
+            for name in names:
+                if name not in options(key, hints.folders):
+                    raise BcrlError(f"{key}={name}: {hints.of_option(key, name)}")
     if arguments.multirun and getattr(arguments, "cfg", None):
         raise BcrlError("--cfg shows one composition; drop -m and the sweep")
-
-
-def _check_options(group: str, names: Iterable[object], folders: Folders) -> None:
-    """Raise BcrlError for an option that no folder has."""
-    places = [Path(folder, group) for folder in (CONF, *folders)]
-    known = {path.stem for place in places for path in place.glob("*.yaml")}
-    for name in map(str, names):
-        if name not in known:
-            raise BcrlError(f"{group}={name}: {did_you_mean(name, known)}")
 
 
 def job(config: DictConfig, hydra: DictConfig) -> Plan:
@@ -184,6 +190,8 @@ def plan(job: DictConfig, hydra: DictConfig, folders: Sequence[str]) -> Plan:
     for group in VARIANT_GROUPS:
         if choices.get(group) is None:
             raise BcrlError(f"{group}: every run needs a choice of it")
+    if choices["env"] == OPEN and OmegaConf.is_missing(job.env, "id"):
+        raise ConfigError("env.id", "???", "name an environment: env.id=CartPole-v1")
     extra = tuple(f for f in folders if Path(f) != CONF)
     config, known = _plain(job), {}
     env, named = choices["env"], ()
@@ -231,9 +239,10 @@ def _jobs(
     jobs = product(overrides)
     first = composed(name, tuple(jobs[0]), folders).hydra
     if not multirun and first.mode != RunMode.MULTIRUN:
-        swept = [o.key_or_group for o in overrides if o.is_sweep_override()]
+        swept = [o.input_line for o in overrides if o.is_sweep_override()]
         if swept:
-            raise BcrlError(f"{swept[0]}: several values are a sweep; add -m")
+            line = shlex.join(["bcrl", "-m", *(o.input_line for o in overrides)])
+            raise BcrlError(f"{swept[0]}: several values are a sweep; add -m: {line}")
         return jobs
     params = [f"{k}={v}" for k, v in (first.sweeper.get("params") or {}).items()]
     return product(parse(params) + overrides)

@@ -12,6 +12,7 @@ from multiprocessing import connection, resource_tracker
 from typing import Any
 
 from bcrl.interrupts import SIGNALS, Stop
+from bcrl.terminal import count
 
 #: A job's arguments, a function to report with, and whether to stop → its result.
 Do = Callable[[Any, Callable[[Any], None], Stop], Any]
@@ -108,7 +109,7 @@ def cores() -> int:
     there = os.cpu_count() or 1
     if hasattr(os, "sched_getaffinity"):
         there = len(os.sched_getaffinity(0))
-    return min(there, int(os.environ.get("SLURM_CPUS_PER_TASK", there)))
+    return min(there, count("SLURM_CPUS_PER_TASK") or there)
 
 
 def _hand(worker: _Worker, waiting: list[tuple[int, Any]]) -> None:

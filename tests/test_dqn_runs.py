@@ -1,6 +1,7 @@
 """Whole DQN runs at smoke scale: records, identical bytes, diverging seeds, the GPU."""
 
 import csv
+import hashlib
 import io
 import json
 import math
@@ -10,9 +11,10 @@ import pandas as pd
 import pytest
 import torch
 
-from bcrl import runner
+from bcrl import api, runner
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.records import is_complete, pending
+from bcrl.report.seedfiles import read_csv
 from bcrl.stage import Team, learn
 from tests.conftest import plan
 from tests.test_runs import digest
@@ -68,8 +70,14 @@ def test_what_a_run_leaves(tmp_path):
     assert [math.isnan(r["loss"]) for r in found] == [True] * 6 + [False]
     text = (p.directory / "seed_0000.csv").read_text()
     assert "nan" not in text and text.splitlines()[1].split(",")[7] == ""
-    table = pd.read_csv(io.StringIO(text))
-    assert table["loss"].dtype == float and table["loss"].isna().sum() == 6
+    document = json.loads((p.directory / "seed_0000.json").read_text())
+    for form in (text, text.replace(",,", ",nan,")):  # now, and as it once was
+        path = tmp_path / "seed_0000.csv"
+        path.write_text(form)
+        document["sha256"]["csv"] = hashlib.sha256(form.encode()).hexdigest()
+        for table in (pd.read_csv(io.StringIO(form)), read_csv(path, document)):
+            assert table["loss"].dtype == float and table["loss"].isna().sum() == 6
+    assert api.read(p.directory)["loss"].dtype == float
     assert all(-150 <= r["return"] <= 0 for r in found[5:])
     about = json.loads((p.directory / "seed_0000.json").read_text())
     assert about["status"] == "complete" and about["learners"] == ["lspi", "dqn"]

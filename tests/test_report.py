@@ -143,6 +143,8 @@ def test_standard_error_is_the_papers():
     assert st.mean(values).tolist() == [2.0, 4.0]
     # deviation of 1, 3 with ddof = 0 is 1, over √2
     assert st.standard_error(values) == pytest.approx([1 / np.sqrt(2), 0.0])
+    assert st.standard_error(values, ddof=1) == pytest.approx([1.0, 0.0])
+    assert np.isnan(st.standard_error(values[:1], ddof=1)).all()
 
 
 def test_interquartile_mean():
@@ -303,7 +305,8 @@ def test_aggregate_recomputed(runs_dir):
     folder = runs_dir / "smoke" / "maze" / "C-FQI"
     values = [pd.read_csv(p)["return"][6] for p in sorted(folder.glob("*.csv"))]
     assert row["mean"].item() == pytest.approx(np.mean(values))
-    assert row["standard_error"].item() == pytest.approx(np.std(values) / np.sqrt(6))
+    expected = np.std(values, ddof=1) / np.sqrt(6)
+    assert row["standard_error"].item() == pytest.approx(expected)
     assert row[["stage", "task", "seeds"]].to_numpy().tolist() == [[4, 4, 6]]
 
 

@@ -259,3 +259,14 @@ def test_other_seeds_than_a_checkpoints_start_by_themselves(tmp_path):
     runner.run(p)
     assert (p.directory / "seed_0000.csv").stat().st_mtime_ns == done
     assert not path.exists() and not runner.records.pending(p)
+
+
+def test_a_file_that_changes_under_a_run_is_not_the_code_that_runs(
+    tmp_path, monkeypatch
+):
+    before = checkpoints._code()
+    (tmp_path / "other.py").write_text("A = 1")
+    monkeypatch.setattr(checkpoints, "__file__", str(tmp_path / "checkpoints.py"))
+    assert checkpoints._ours() != checkpoints.OURS  # what is on disk now
+    checkpoints._code.cache_clear()
+    assert checkpoints._code() == before

@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.compiling import kept
 from bcrl.envs.base import Step, check_episodes
 from bcrl.errors import ConfigError
 
@@ -107,7 +107,7 @@ class CarOnHill:
         return np.stack(np.meshgrid(p, v, indexing="ij"), -1).reshape(-1, 2)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kept(nogil=True, error_model="numpy")
 def _acceleration(p: float, v: float, pull: float, left: bool) -> float:
     """dv/dt [m/s²] on the left or right branch of the hill, both continued past 0."""
     if left:
@@ -120,7 +120,7 @@ def _acceleration(p: float, v: float, pull: float, left: bool) -> float:
     return force / (q2 * q2 + q)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kept(nogil=True, error_model="numpy")
 def _runge_kutta(
     p: float, v: float, dt: float, pull: float, left: bool
 ) -> tuple[float, float]:
@@ -149,7 +149,7 @@ def _runge_kutta(
     return p, v
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kept(nogil=True, error_model="numpy")
 def _exit_time(p: float, v: float, a: float, left: bool) -> float:
     """Seconds until p leaves its branch through 0 at constant acceleration, or inf."""
     if left:
@@ -163,7 +163,7 @@ def _exit_time(p: float, v: float, a: float, left: bool) -> float:
     return 2.0 * p / bottom if bottom > 0.0 else 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kept(nogil=True, error_model="numpy")
 def _cross(
     p: float, v: float, dt: float, pull: float, left: bool
 ) -> tuple[float, float, float]:
@@ -188,7 +188,7 @@ def _cross(
     return best_p, best_v, best_t
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kept(nogil=True, error_model="numpy")
 def _advance(p: float, v: float, pull: float) -> tuple[float, float]:
     """(p, v) after 0.1 s under `pull` = u / m [m/s²], whatever the bounds.
 
@@ -220,7 +220,7 @@ def _advance(p: float, v: float, pull: float) -> tuple[float, float]:
     return p, v
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kept(nogil=True, error_model="numpy")
 def _outcome(p: float, v: float) -> float:
     """Reward on arriving at (p, v): +1 at the goal, −1 if lost (NaN too), else 0."""
     if not (p >= -MAX_POSITION and abs(v) <= MAX_SPEED):
@@ -228,7 +228,7 @@ def _outcome(p: float, v: float) -> float:
     return 1.0 if p > MAX_POSITION else 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kept(nogil=True, error_model="numpy")
 def _steps(
     state: NDArray[np.float64], action: NDArray[np.int64], mass: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:

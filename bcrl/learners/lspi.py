@@ -45,7 +45,7 @@ class LSPI:
         """Environment steps of a stage."""
         return self.steps
 
-    def episodes(self, env: Env) -> int:
+    def episodes_per_iteration(self, env: Env) -> int:
         """Episodes per iteration; ConfigError unless `steps` are whole ones."""
         whole, rest = divmod(self.steps, self.iterations * env.horizon)
         if rest or not whole:
@@ -104,7 +104,8 @@ class LSPI:
         self, stage: Stage, gain: NDArray, iteration: int, team: Team
     ) -> tuple[NDArray, NDArray, NDArray]:
         """Each seed's (s, a) (S, n, m), next (s', K s') and rewards (S, n)."""
-        env, k, episodes = stage.env, gain.shape[1], self.episodes(stage.env)
+        env, k = stage.env, gain.shape[1]
+        episodes = self.episodes_per_iteration(env)
         rngs = [stream(x, "data", stage.number, iteration) for x in team.seeds]
         begin = np.stack([start_states(rng, env, episodes) for rng in rngs])
         shape = (env.horizon, episodes, k + env.step_noise)

@@ -12,6 +12,7 @@ from typing import NoReturn
 from bcrl.envs import is_finite
 from bcrl.errors import BcrlError, did_you_mean
 from bcrl.oracle import oracles
+from bcrl.terminal import ready
 
 PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
 
@@ -62,6 +63,7 @@ def run(arguments: Sequence[str]) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code: 0; 2 for what the user can mend; 1 if output cannot be written."""
+    ready()
     try:
         run(sys.argv[1:] if arguments is None else arguments)
     except BcrlError as error:

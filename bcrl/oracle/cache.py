@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.errors import BcrlError
-from bcrl.files import make_directory, write_text
+from bcrl.files import make_directory, user_folder, write_text
 
 SEAL = b"# sha256 "
 
@@ -21,8 +21,9 @@ def directory() -> Path:
     """${BCRL_CACHE:-${XDG_CACHE_HOME:-~/.cache}/bcrl}; RuntimeError without a home."""
     if chosen := os.environ.get("BCRL_CACHE"):
         return Path(chosen).expanduser()
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "bcrl"
+    if base := user_folder("XDG_CACHE_HOME", ".cache"):
+        return base / "bcrl"
+    raise RuntimeError("no home")
 
 
 def cached(

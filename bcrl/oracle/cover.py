@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.compiling import kept
 from bcrl.envs.car_on_hill import MAX_POSITION, MAX_SPEED, CarOnHill
 
 #: Box margin beyond the corners' images, in cells. A cell's image bends away from its
@@ -71,7 +71,7 @@ def cover(mass: float, cells: int) -> Cover:
     return Cover(bound, forever)
 
 
-@numba.njit(cache=True, nogil=True)
+@kept(nogil=True)
 def _accumulate(marked: NDArray[np.bool_], total: NDArray[np.int32]) -> None:
     """total[i, j] = marked cells before row i and column j."""
     for i in range(marked.shape[0]):
@@ -81,7 +81,7 @@ def _accumulate(marked: NDArray[np.bool_], total: NDArray[np.int32]) -> None:
             total[i + 1, j + 1] = total[i, j + 1] + row
 
 
-@numba.njit(cache=True, nogil=True)
+@kept(nogil=True)
 def _inside(total: NDArray[np.int32], box: NDArray[np.int16]) -> tuple[int, int]:
     """Marked cells, and all cells, that a box [[i0, j0], [i1, j1]] touches."""
     i0, j0, i1, j1 = box[0, 0], box[0, 1], box[1, 0] + 1, box[1, 1] + 1
@@ -89,7 +89,7 @@ def _inside(total: NDArray[np.int32], box: NDArray[np.int16]) -> tuple[int, int]
     return marked, (i1 - i0) * (j1 - j0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kept(nogil=True)
 def _spread(
     bound: NDArray[np.int16], span: NDArray[np.int16], alive: NDArray[np.bool_]
 ) -> None:
@@ -110,7 +110,7 @@ def _spread(
                         grown = True
 
 
-@numba.njit(cache=True, nogil=True)
+@kept(nogil=True)
 def _erode(
     forever: NDArray[np.bool_], span: NDArray[np.int16], safe: NDArray[np.bool_]
 ) -> None:

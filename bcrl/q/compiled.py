@@ -12,8 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
-from numba import njit
-
+from bcrl.compiling import kept
 from bcrl.q import descend, fused, grow, kernel, lanes, rows, tiles
 
 
@@ -24,7 +23,7 @@ def _fingerprint(*modules: ModuleType) -> int:
     return int.from_bytes(digest.digest()[:6], "big")
 
 
-_compiled = njit(cache=True, nogil=True)
+_compiled = kept(nogil=True)
 
 
 def _forest(fingerprint: int) -> tuple[Callable, Callable]:

@@ -20,6 +20,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -28,15 +29,20 @@ from bcrl.q.compiled import grow_forest, predict_forest
 
 #: Stand-ins for what a regression leaves out.
 NO_COUNTS = np.empty(0, np.int64)
+UNLIMITED = 2**62
 
 
 @dataclass(frozen=True)
 class TreeSettings:
-    """What scikit-learn calls by the same names; max_features None tries all."""
+    """What scikit-learn calls by the same names.
+
+    max_features None tries all, max_depth None is no limit.
+    """
 
     min_samples_split: int = 2
     min_samples_leaf: int = 1
     max_features: int | None = None
+    max_depth: int | None = None
 
 
 @dataclass
@@ -108,6 +114,40 @@ def join(forests: Sequence[Forest]) -> Forest:
     return Forest(nodes, values, starts, depths, forests[0].n_features)
 
 
+def importances(
+    forest: Forest, x: np.ndarray, y: np.ndarray, multiplicity: np.ndarray
+) -> np.ndarray:
+    """Each feature's share (d,) of the variance that the splits take off, or zeros.
+
+    x (n, d) float32, y (n,), multiplicity (n,): what the forest was fitted to. The mean
+    of the trees' shares, as scikit-learn defines it (Breiman et al. 1984).
+    """
+    bits = (x + np.float32(0.0)).view(np.int32)  # −0 is taken as +0
+    keys = bits ^ ((bits >> 31) & np.int32(2**31 - 1))  # `kernel.key_of`
+    y = y - np.average(y, weights=multiplicity)
+    moments = multiplicity * np.stack([np.ones(len(y)), y, y * y])
+    shares = np.zeros((len(forest.depths), x.shape[1]))
+    for share, (root, end) in zip(shares, pairwise(forest.first), strict=True):
+        nodes = forest.nodes[root:end]
+        sums = np.zeros((3, len(nodes)))  # of each node's rows: weight, y and y²
+        rows, at = np.arange(len(x)), np.zeros(len(x), np.intp)
+        while len(rows):  # each turn is a level of the tree
+            for total, moment in zip(sums, moments, strict=True):
+                total += np.bincount(at, moment[rows], len(nodes))
+            inner = nodes["feature"][at] >= 0
+            rows, node = rows[inner], nodes[at[inner]]
+            at = node["child"] - root + (keys[rows, node["feature"]] > node["cut"])
+        weight, first, second = sums
+        spread = second - first**2 / weight
+        split = np.flatnonzero(nodes["feature"] >= 0)
+        left = nodes["child"][split] - root
+        taken = spread[split] - spread[left] - spread[left + 1]
+        np.add.at(share, nodes["feature"][split], np.maximum(taken, 0.0))
+    whole = shares.sum(1, keepdims=True)
+    shares = (shares / np.where(whole > 0.0, whole, 1.0)).sum(0)
+    return shares / max(shares.sum(), 1e-300)
+
+
 def fit_forests(
     regressions: Sequence[Regression],
     settings: TreeSettings,
@@ -121,12 +161,12 @@ def fit_forests(
     Raises ConfigError for settings, BcrlError for data that no forest can be fitted to.
     """
     limits = _limits(settings)
-    most = settings.max_features
     checked = [_checked(regression) for regression in regressions]
 
     def fit(arguments: tuple[np.ndarray, ...]) -> Fitted:
         d = arguments[0].shape[1]
-        numbers = (*limits, d if most is None else min(int(most), d))
+        min_split, min_leaf, most, deepest = limits
+        numbers = (min_split, min_leaf, min(most, d), deepest)
         nodes, values, first, depths, fitted, queried = grow_forest(
             *arguments, numbers, keep
         )
@@ -160,19 +200,22 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads)
 
 
-def _limits(settings: TreeSettings) -> tuple[int, int]:
-    """min_samples_split and min_samples_leaf, after a check of all settings."""
+def _limits(settings: TreeSettings) -> tuple[int, ...]:
+    """The settings as the compiled code takes them, checked."""
+    found = []
     for name, least in (
         ("min_samples_split", 2),
         ("min_samples_leaf", 1),
         ("max_features", 1),
+        ("max_depth", 1),
     ):
         value = getattr(settings, name)
-        if value is None and name == "max_features":
-            continue
+        if value is None and name.startswith("max"):
+            value = UNLIMITED
         if not isinstance(value, int | np.integer) or value < least:
             raise ConfigError(name, value, f"must be an integer of at least {least}")
-    return int(settings.min_samples_split), int(settings.min_samples_leaf)
+        found.append(int(value))
+    return tuple(found)
 
 
 def _points(name: str, x: np.ndarray, d: int | None = None) -> np.ndarray:

@@ -42,7 +42,7 @@ def grow_tree(
     `grow_forest`; nodes, values: where to put the tree if `keep`, from `n_nodes` and
     `n_values` on. Returns the new `n_nodes`, `n_values`, and the tree's depth.
     """
-    min_split, min_leaf, max_features = settings
+    min_split, min_leaf, max_features, max_depth = settings
     node, depth, deepest, top = n_nodes, 0, 0, 0
     n_nodes += 1
     size, q_size = U(fitted.size), U(queried.size)
@@ -54,6 +54,7 @@ def grow_tree(
         feature, cut, w_left, s_left = -1, np.int32(0), np.int64(0), np.int64(0)
         if (
             w_node >= min_split
+            and depth < max_depth
             and w_node >= 2 * min_leaf
             and not is_pure(target, weight, here + start, here + stop, w_node, unit)
         ):
@@ -145,7 +146,7 @@ def grow_forest(x, y, multiplicity, seeds, queries, settings, keep):
 
     x: (n, d) float32; y: (n,) float64; multiplicity: (n,) int64, or empty if all are 1;
     seeds: (T,) uint64; queries: (m, d) float32; settings: min_samples_split,
-    min_samples_leaf, max_features.
+    min_samples_leaf, max_features, max_depth.
     Returns nodes, leaf values, first node of each tree (T+1,), depths (T,), fitted
     (n,), queried (m,); nodes and values are empty unless `keep`.
     """

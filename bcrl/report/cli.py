@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import inspect
 import sys
 from collections.abc import Callable, Sequence
@@ -11,11 +10,11 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bcrl import __version__
 from bcrl.errors import BcrlError
 from bcrl.files import make_directory, write_text
 from bcrl.report import style
 from bcrl.report.animation import animations, gif_of
+from bcrl.report.arguments import Parser
 from bcrl.report.curves import LINEAR, figure_methods
 from bcrl.report.document import claims_report
 from bcrl.report.figures import env_title, figure_1, figure_2, figure_5
@@ -27,6 +26,7 @@ from bcrl.report.page import Picture, Pictures, page
 from bcrl.report.sweeps import groups, sweep_report, sweep_table
 from bcrl.report.tables import aggregate
 from bcrl.report.variants import Runs
+from bcrl.terminal import ready, say, show
 
 #: figure → environment, experiment that makes its runs, method it cannot do without
 FIGURES: dict[str, tuple[str, str, str | None, Callable[..., Figure]]] = {
@@ -40,15 +40,12 @@ FIGURES: dict[str, tuple[str, str, str | None, Callable[..., Figure]]] = {
 CURVES = "curves"  # learning curves of what the paper has no figure of
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """The command line; its help is the reference."""
-    result = argparse.ArgumentParser(
+    result = Parser(
         prog="bcrl-report",
         description="Draw figures of finished runs, judge the paper's claims, and show "
         "all of it on one HTML page.",
-    )
-    result.add_argument(
-        "--runs-dir", type=Path, default=Path("runs"), help="default: %(default)s"
     )
     result.add_argument(
         "--scale",
@@ -81,7 +78,6 @@ def parser() -> argparse.ArgumentParser:
         help="draw what is complete of unfinished runs, and say so in every figure",
     )
     result.add_argument("--out", type=Path, help="default: figures in the runs' folder")
-    result.add_argument("--version", action="version", version=__version__)
     return result
 
 
@@ -172,14 +168,15 @@ def _write_csv(path: Path, table: pd.DataFrame) -> Path:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; 0 if all went well, 2 with one message for what a user can mend."""
-    options = parser().parse_args(arguments)
-    chosen = [*FIGURES, CURVES]
-    if "all" not in options.figures:
-        chosen = list(dict.fromkeys(options.figures))
+    ready()
     try:
+        options = parser().asked(arguments)
+        chosen = [*FIGURES, CURVES]
+        if "all" not in options.figures:
+            chosen = list(dict.fromkeys(options.figures))
         runs = load_runs(options.runs_dir, options.scale, options.allow_incomplete)
         for note in runs.notes:
-            print(f"note: {note.text}", file=sys.stderr)
+            say(f"note: {note.text}")
         out = options.out or options.runs_dir / "figures"
         make_directory(out, "--out")
         shown, not_shown = [], []
@@ -188,11 +185,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         files, skipped = report(runs, out, chosen, options.tag)
         files, skipped = files + shown, skipped + not_shown
     except BcrlError as error:
-        print(f"bcrl-report: {error}", file=sys.stderr)
+        say(f"bcrl-report: {error}")
         return 2
     for line in skipped if options.scale != "search" else ():
-        print(f"skipped {line}", file=sys.stderr)
-    print("\n".join(map(str, files)))
+        say(f"skipped {line}")
+    show("\n".join(map(str, files)))
     return 0
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.colors import to_hex, to_rgb
 from numpy.typing import NDArray
 
+from bcrl.divergence import diverging
 from bcrl.report import style
 from bcrl.report.curves import LINEAR, figure_methods
 from bcrl.report.figures import optimum_of
@@ -82,6 +83,7 @@ def _series(variant: Variant, metrics: list[str]) -> dict[str, Any]:
         first, median, third = np.quantile(found.values, [0.25, 0.5, 0.75], axis=0)
         series |= {"x": found.x.tolist(), "task": variant.task[found.rows].tolist()}
         series["metrics"][metric] = {
+            "far": metric in diverging(variant.metrics),  # the axis leaves it out
             "mean": _numbers(found.mean, 7),
             "low": _numbers(found.low),
             "high": _numbers(found.high),

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from bcrl.divergence import diverging
 from bcrl.report import style
 from bcrl.report.notes import remarks, tags_shown
 from bcrl.report.statistics import mean, standard_error
@@ -62,10 +63,16 @@ def optimum_of(methods: Mapping[str, Variant]) -> float | None:
 
 def _mean_bands(axes: Axes, methods: Mapping[str, Variant], metric: str) -> None:
     """Mean ± 2 standard errors of every method."""
+    far, within = [], []
     for name, variant in methods.items():
         values = variant.metrics[metric]
         centre, half = mean(values), 2 * standard_error(values)
         style.band(axes, variant.index, centre, centre - half, centre + half, name)
+        if metric in diverging(variant.metrics):
+            far.append(name)
+        else:
+            within += [centre - half, centre + half]
+    style.cut(axes, far, within)
 
 
 def _panels(
@@ -97,9 +104,15 @@ def figure_1(runs: Runs, tag: str | None = None) -> Figure:
                 linestyle=(0, (3, 2)),
                 alpha=0.45,
             )
+        far, within = [], []
         for name, variant in methods.items():
             centre = mean(variant.metrics[metric])
             axes.plot(variant.index, centre, color=style.colour(name), linewidth=2.0)
+            if metric in diverging(variant.metrics):
+                far.append(name)
+            else:
+                within.append(variant.metrics[metric])
+        style.cut(axes, far, within)
     style.legend(figure, methods)
     what = "bold: mean over seeds, dashed: single seeds"
     style.footer(figure, small_print(runs, methods, what, style.WIDTH))

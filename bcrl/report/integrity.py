@@ -14,12 +14,14 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from bcrl.files import seed_path
 from bcrl.identity import differences, identity
 from bcrl.report.findings import AGAIN, INCOMPLETE, Finding, Refused
 from bcrl.report.notes import listed, ranges
 from bcrl.report.seedfiles import (
     INDEX,
     asked,
+    command,
     family_of,
     read_csv,
     read_document,
@@ -87,7 +89,7 @@ def check_folder(folder: Path) -> Checked:
     documents = _documents(folder, numbers, findings)
     findings += _config_findings(folder, documents)
     for seed, document in documents.items():
-        csv, npz = (_path(folder, seed, suffix) for suffix in ("csv", "npz"))
+        csv, npz = (seed_path(folder, seed, suffix) for suffix in ("csv", "npz"))
         state = status(document)
         try:
             if state != "running" and "sha256" in document:
@@ -105,16 +107,12 @@ def check_folder(folder: Path) -> Checked:
     return result
 
 
-def _path(folder: Path, seed: int, suffix: str) -> Path:
-    return folder / f"seed_{seed:04d}.{suffix}"
-
-
 def _numbers(folder: Path, findings: list[Finding]) -> set[int]:
     """The seeds that any file is named after; misnamed files are findings."""
     numbers = set()
     for path in _entries(folder, findings):
         match = re.fullmatch(r"seed_([0-9]+)\.(csv|npz|json)", path.name)
-        if match and path == _path(folder, int(match[1]), match[2]):
+        if match and path == seed_path(folder, int(match[1]), match[2]):
             numbers.add(int(match[1]))
         elif path.name.startswith("seed_"):
             what = "is not a name that bcrl gives"
@@ -131,7 +129,7 @@ def _documents(
     belongs = {"scale": scale, "env": env, "variant": variant, "tag": tag or None}
     documents = {}
     for seed in sorted(numbers):
-        path = _path(folder, seed, "json")
+        path = seed_path(folder, seed, "json")
         try:
             documents[seed] = read_document(path, {"seed": seed} | belongs)
         except Refused as error:
@@ -159,9 +157,9 @@ def _config_findings(folder: Path, documents: Documents) -> list[Finding]:
         return [Finding(path, what, anew)]
     return [
         Finding(
-            _path(folder, seed, "json"),
+            seed_path(folder, seed, "json"),
             f"has another config than config.yaml ({_changed(config, made[seed])})",
-            f"delete {_path(folder, seed, '*')} and {AGAIN}",
+            f"delete {seed_path(folder, seed, '*')} and {AGAIN}",
         )
         for seed in odd
     ]
@@ -192,11 +190,11 @@ def _index_findings(folder: Path, tables: Mapping[int, pd.DataFrame]) -> list[Fi
     model = next(seed for seed in keys if keys[seed] == usual)
     return [
         Finding(
-            _path(folder, seed, "csv"),
-            f"differs from {_path(folder, model, 'csv').name} in its "
+            seed_path(folder, seed, "csv"),
+            f"differs from {seed_path(folder, model, 'csv').name} in its "
             f"{_columns(indices[seed], indices[model])}, so the folder mixes two "
             "configurations or versions",
-            f"delete {_path(folder, seed, '*')} and {AGAIN}",
+            f"delete {seed_path(folder, seed, '*')} and {AGAIN}",
         )
         for seed in keys
         if keys[seed] != usual
@@ -215,7 +213,7 @@ def _incomplete_findings(
 ) -> Iterator[Finding]:
     """Seeds that are not complete: begun, failed, or not there though asked for."""
     for seed, document in documents.items():
-        path = _path(folder, seed, "json")
+        path = seed_path(folder, seed, "json")
         if status(document) == "running":
             what = 'says "running": it is being computed, or its process was killed'
             yield Finding(path, what, AGAIN, INCOMPLETE)
@@ -236,6 +234,6 @@ def _incomplete_findings(
 
 def _command(documents: Iterable[dict[str, Any]], seed: int) -> str:
     """What to do about a missing seed: the command that asked for it, if known."""
-    commands = (d.get("command") for d in documents if seed in asked(d))
-    command = next(filter(None, commands), None)
-    return f"{AGAIN} (`{command}`)" if command else AGAIN
+    commands = (command(d) for d in documents if seed in asked(d))
+    found = next(filter(None, commands), None)
+    return f"{AGAIN} (`{found}`)" if found else AGAIN

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from bcrl.divergence import diverging
 from bcrl.report import style
 from bcrl.report.figures import small_print
 from bcrl.report.statistics import bootstrap_curves, mean
@@ -115,10 +116,17 @@ def figure_curves(runs: Runs, env: str, family: str, tag: str | None = None) -> 
     for axes, metric in zip(panels, metrics, strict=False):
         if spans:
             style.shade_tasks(axes, spans)
+        far, within = [], []
         for name, variant in methods.items():
-            if metric in variant.metrics:
-                found = curve(variant, metric)
-                style.band(axes, found.x, found.mean, found.low, found.high, name)
+            if metric not in variant.metrics:
+                continue
+            found = curve(variant, metric)
+            style.band(axes, found.x, found.mean, found.low, found.high, name)
+            if metric in diverging(variant.metrics):
+                far.append(name)
+            else:
+                within += [found.mean, found.low, found.high]
+        style.cut(axes, far, within)
         axes.set_xlabel(COUNTED[family])
         axes.set_ylabel(label(family, metric))
         axes.margins(x=0.0)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bcrl.divergence import diverging
 from bcrl.errors import BcrlError
 from bcrl.report.findings import BROKEN, INCOMPLETE, Finding
 from bcrl.report.integrity import Checked, check_tree
@@ -63,7 +65,8 @@ def _refuse(
     lines += [f"  {finding}" for finding in refused[:LISTED]]
     if len(refused) > LISTED:
         more = len(refused) - LISTED
-        lines.append(f"  and {more} more; `bcrl-verify {runs_dir}` lists all")
+        shown = shlex.join(["bcrl-verify", str(runs_dir)])
+        lines.append(f"  and {more} more; `{shown}` lists all")
     if any(finding.kind == INCOMPLETE for finding in refused):
         lines.append("--allow-incomplete draws what is complete and says so in figures")
     if allow_incomplete:
@@ -76,9 +79,10 @@ def _nothing(runs_dir: Path, scale: str, notes: list[Note]) -> str:
     others = sorted({p.parts[-4] for p in runs_dir.glob("*/*/*/seed_*.json")} - {scale})
     there = f"; there are runs at scale {listed(others)}" if others else ""
     seen = f" ({notes[0].text})" if notes else ""
+    shown = shlex.join(["bcrl", "experiment=fig1", f"scale={scale}"])
     return (
         f"no complete runs under {runs_dir / scale}{seen}{there}: "
-        f"`bcrl experiment=fig1 scale={scale}` makes those of figure 1, "
+        f"`{shown}` makes those of figure 1, "
         "experiment=fig2 those of figures 2, 3 and 5, experiment=fig4 those of "
         "figure 4"
     )
@@ -111,6 +115,10 @@ def _variant(checked: Checked, notes: list[Note]) -> Variant | None:
         values[~np.isfinite(values)] = np.nan  # a gap, not a line to infinity
     sidecars = tuple(checked.documents.values())
     notes.extend(_mixed_code(folder, env, method, tag, sidecars))
+    if far := diverging(metrics):
+        which = ", ".join(f"{name} up to {value:.3g}" for name, value in far.items())
+        footer = f"{folder.name} diverges ({which})"
+        notes.append(Note(f"{folder}: diverges, {which}", env, tag, footer, method))
     stage, task, index = (
         first[column].to_numpy().astype(np.int64)
         for column in ("stage", "task", counter)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 from bcrl.identity import differences, flat, identity
 from bcrl.report.document import duration
 from bcrl.report.figures import env_title
 from bcrl.report.notes import ranges
+from bcrl.report.seedfiles import command
 from bcrl.report.tables import Table, number
 from bcrl.report.variants import Runs, Variant
 
@@ -61,7 +61,7 @@ def _configuration(variant: Variant, reference: Variant) -> dict[str, Any]:
     ]
     absent = [k for k in differing if k not in flat(identity(config))]
     lines += [(key, "absent", _text(differing[key][1])) for key in absent]
-    commands = dict.fromkeys(_command(sidecar) for sidecar in variant.sidecars)
+    commands = dict.fromkeys(command(sidecar) for sidecar in variant.sidecars)
     differ = f", {len(differing)} differ" if differing else ""
     return {
         "name": variant.name,
@@ -73,12 +73,6 @@ def _configuration(variant: Variant, reference: Variant) -> dict[str, Any]:
 
 def _text(value: object) -> str:
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-
-
-def _command(sidecar: dict[str, Any]) -> str:
-    """The command that made a seed, without the folder its program lies in."""
-    program, *arguments = str(sidecar.get("command") or "").split(" ")
-    return " ".join([Path(program).name, *arguments])
 
 
 def provenance(runs: Runs) -> list[str | Table]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shlex
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -92,6 +93,19 @@ def status(document: Mapping[str, Any]) -> str:
 def asked(document: Mapping[str, Any]) -> set[int]:
     """The seeds that were asked for when this one was made."""
     return {seed for a, b in document["asked"] for seed in range(a, b + 1)}
+
+
+def command(document: Mapping[str, Any]) -> str:
+    """The command that made a seed, to be pasted; empty if it isn't recorded.
+
+    Older records are not quoted: their words are what spaces separate.
+    """
+    recorded = str(document.get("command") or "")
+    try:
+        words = shlex.split(recorded)
+    except ValueError:  # an older one with a single quote
+        words = recorded.split(" ")
+    return shlex.join([Path(word).name for word in words[:1]] + words[1:])
 
 
 def _bytes(path: Path) -> bytes:

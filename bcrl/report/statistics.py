@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 RESAMPLES = 10_000
 LEVEL = 0.95
+BLOCK = 4_000_000  # resampled seeds that are held in memory at a time
 SEED = 20_220_425  # every interval draws from its own generator, started from this
 NORMAL_QUANTILE = 1.959963984540054  # Φ⁻¹(0.975), the two-sided 95 % point
 
@@ -27,12 +28,14 @@ def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.mean(values, axis=0)
 
 
-def standard_error(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard error of the mean over seeds: (S, …) → (…).
+def standard_error(values: NDArray[np.float64], ddof: int = 0) -> NDArray[np.float64]:
+    """Standard error of the mean over seeds: (S, …) → (…), nan if S ≤ ddof.
 
-    Deviation with ddof = 0 over √S, as in the paper's released evaluation.
+    The paper's figures have ddof = 0, as its released evaluation; tables have 1.
     """
-    return np.std(values, axis=0, ddof=0) / math.sqrt(len(values))
+    if len(values) <= ddof:
+        return np.full(values.shape[1:], math.nan)
+    return np.std(values, axis=0, ddof=ddof) / math.sqrt(len(values))
 
 
 def interquartile_mean(values: ArrayLike) -> float:
@@ -60,8 +63,14 @@ def _resampled(
 ) -> NDArray[np.float64]:
     """`statistic` of RESAMPLES draws with replacement from (S,) values, (B,)."""
     values = np.asarray(values, dtype=float)
-    rows = rng.integers(len(values), size=(RESAMPLES, len(values)))
-    return statistic(values[rows])
+    return np.concatenate([statistic(values[r]) for r in _rows(len(values), rng)])
+
+
+def _rows(n: int, rng: np.random.Generator) -> Iterator[NDArray[np.int64]]:
+    """RESAMPLES draws of n seeds' places, in blocks (B, n); blocks change no draw."""
+    most = max(1, BLOCK // n)
+    for begun in range(0, RESAMPLES, most):
+        yield rng.integers(n, size=(min(most, RESAMPLES - begun), n))
 
 
 def _percentiles(draws: NDArray[np.float64]) -> Interval:
@@ -93,11 +102,13 @@ def bootstrap_curves(
     n = len(values)
     if n < 2:
         return np.full((2, values.shape[1]), math.nan)
-    rows = np.random.default_rng(SEED).integers(n, size=(RESAMPLES, n))
-    places = rows + n * np.arange(RESAMPLES)[:, None]
-    counts = np.bincount(places.ravel(), minlength=RESAMPLES * n).reshape(-1, n)
+    means = []
+    for rows in _rows(n, np.random.default_rng(SEED)):
+        places = rows + n * np.arange(len(rows))[:, None]
+        counts = np.bincount(places.ravel(), minlength=rows.size).reshape(-1, n)
+        means.append(counts @ values / n)
     tail = (1.0 - LEVEL) / 2.0
-    low, high = np.quantile(counts @ values / n, [tail, 1.0 - tail], axis=0)
+    low, high = np.quantile(np.concatenate(means), [tail, 1.0 - tail], axis=0)
     return low, high
 
 

@@ -143,6 +143,23 @@ def band(
     axes.plot(x, centre, color=colour(method), linewidth=1.6, linestyle=line)
 
 
+def cut(axes: Axes, names: Sequence[str], within: Sequence[NDArray]) -> None:
+    """Let the y-axis show what is `within`, and say whose curves leave it.
+
+    For curves `names` that diverge: they would flatten all others.
+    """
+    shown = np.concatenate([np.ravel(values) for values in within] or [[]])
+    shown = shown[np.isfinite(shown)]
+    if not names or not len(shown):
+        return
+    low, high = float(shown.min()), float(shown.max())
+    room = 0.05 * (high - low) or 0.05 * abs(high) or 0.5
+    axes.set_ylim(low - room, high + room)
+    text = f"cut: {', '.join(names)} diverge{'s' * (len(names) == 1)}"
+    place = {"xycoords": "axes fraction", "ha": "right", "va": "top"}
+    axes.annotate(text, (0.99, 0.98), fontsize=6.5, color="0.35", **place)
+
+
 def legend(figure: Figure, methods: Iterable[str], optimum: bool = False) -> None:
     """One legend for the whole figure, above it."""
     handles = [

@@ -31,7 +31,8 @@ def aggregate(runs: Runs, family: str = "FQI") -> pd.DataFrame:
     """Mean and standard error over seeds of every metric at every evaluation.
 
     One row per (variant, iteration or step, metric), tagged variants included; columns
-    AGGREGATE_COLUMNS[family]. A mean over a non-finite value is empty.
+    AGGREGATE_COLUMNS[family]. A mean over a non-finite value is empty, as is the
+    standard error (ddof = 1) of a single seed.
     """
     columns = AGGREGATE_COLUMNS[family]
     *_, counter = INDEX[family]
@@ -50,7 +51,7 @@ def aggregate(runs: Runs, family: str = "FQI") -> pd.DataFrame:
                 "metric": metric,
                 "seeds": len(variant.seeds),
                 "mean": mean(values),
-                "standard_error": standard_error(values),
+                "standard_error": standard_error(values, ddof=1),
             }
             blocks.append(pd.DataFrame(block, columns=columns))
     return pd.concat(blocks, ignore_index=True)

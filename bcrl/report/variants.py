@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.files import seed_path
 from bcrl.report.notes import Note
 from bcrl.report.seedfiles import read_arrays
 
@@ -66,7 +67,7 @@ class Variant:
 
     def npz(self, seed: int) -> Path:
         """Where a seed's arrays are."""
-        return self.folder / f"seed_{seed:04d}.npz"
+        return seed_path(self.folder, seed, "npz")
 
 
 @dataclass(frozen=True)

@@ -198,6 +198,7 @@
           series, x: pick(series.x), task: pick(series.task),
           y: pick(found[this.state.centre]), low: pick(low), high: pick(high),
           seeds: this.state.seeds ? found.seeds.map(pick) : [],
+          far: found.far,
         };
       });
       const optimum = metric === "return" ? this.data.optimum : null;
@@ -284,7 +285,9 @@
         low = Math.min(low, y);
         high = Math.max(high, y);
       });
-      for (const each of lines) {
+      // Curves that diverge would flatten the others; the notes name them.
+      const near = lines.filter((each) => !each.far);
+      for (const each of near.length ? near : lines) {
         take(each.x, each.y);
         if (this.state.spread) { take(each.x, each.low); take(each.x, each.high); }
         each.seeds.forEach((seed) => take(each.x, seed));

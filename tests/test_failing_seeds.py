@@ -112,7 +112,7 @@ def test_a_regressor_that_fails_one_seed_fails_that_seed_alone(env, sick, transf
     }
     assert word[sick.way] in why
     if sick.way in ("raises", "memory", "predict"):
-        assert "test_failures.py:" in why  # where in the user's code
+        assert "test_failing_seeds.py:" in why  # where in the user's code
 
 
 def test_a_table_that_is_not_finite_is_walked_safely_and_named():
@@ -195,7 +195,7 @@ class SickForest(ForestRegressor):
 def test_files_and_exit_code_of_a_seed_that_failed(tmp_path, monkeypatch):
     monkeypatch.setenv("BCRL_TRUST", "tests")
     small = ("env=maze", "scale=smoke", "progress=none", "seeds.count=3", "tag=t")
-    mine = "algorithm.regressor.name=tests.test_failures.SickForest"
+    mine = "algorithm.regressor.name=tests.test_failing_seeds.SickForest"
     p = plan(*small, mine, f"runs_dir={tmp_path / 'sick'}")
     with pytest.raises(BcrlError) as told:
         runner.run(p)

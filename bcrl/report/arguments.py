@@ -1,0 +1,73 @@
+"""Arguments of `bcrl-report` and `bcrl-verify`: `key=VALUE` or `--key VALUE`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from bcrl import __version__
+from bcrl.errors import BcrlError, closest
+
+#: What people type for a flag that is called otherwise.
+HABITS = {"help": "--help", "version": "--version", "v": "--version", "output": "--out"}
+HABITS |= {"out_dir": "--out", "results": "--runs-dir", "dir": "--runs-dir"}
+SCALES = ("smoke", "quick", "paper", "search")
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose refusals are a BcrlError with the words to type."""
+
+    def __init__(self, prog: str, description: str) -> None:
+        super().__init__(prog=prog, description=description)
+        self.add_argument("--version", action="version", version=f"bcrl {__version__}")
+        self.add_argument(
+            "--runs-dir",
+            type=Path,
+            default=Path("runs"),
+            metavar="PATH",
+            help="the results, also runs_dir=PATH as bcrl has it; default: %(default)s",
+        )
+
+    def asked(self, words: Sequence[str] | None = None) -> Namespace:
+        """What the words ask for; BcrlError for one that asks for nothing."""
+        given = sys.argv[1:] if words is None else list(words)
+        flags = [flag for each in self._actions for flag in each.option_strings]
+        spelt = [self._spelt(word, flags) for word in given]
+        asked, left = self.parse_known_args(spelt)
+        if left:
+            place = spelt.index(left[0]) if left[0] in spelt else len(given) - 1
+            word, after = given[place], "".join(given[place + 1 : place + 2])
+            raise BcrlError(f"{word}: unknown; {self._meant(word, after, flags)}")
+        return asked
+
+    def error(self, message: str) -> NoReturn:
+        """Raise BcrlError."""
+        raise BcrlError(f"{message}; see {self.prog} --help")
+
+    def _spelt(self, word: str, flags: Sequence[str]) -> str:
+        """`runs_dir=PATH` and `--runs_dir=PATH` as `--runs-dir=PATH`."""
+        key, equals, value = word.partition("=")
+        flag = f"--{key.removeprefix('--').replace('_', '-')}"
+        known = flag in flags and (equals or key.startswith("--"))
+        return flag + equals + value if known else word
+
+    def _meant(self, word: str, after: str, flags: Sequence[str]) -> str:
+        """What an unknown word may mean."""
+        key, equals, value = word.lstrip("+-").partition("=")
+        value, name = value or after, key.lower().replace("-", "_").rstrip(":")
+        scale = closest(word, SCALES, 0.8) if "--scale" in flags else None
+        if scale:
+            return f"did you mean --scale {scale}?"
+        if Path(word).is_dir() and not word.startswith("-"):
+            return f"did you mean runs_dir={word}?"
+        near = closest(f"--{name.replace('_', '-')}", flags, 0.6)
+        flag = HABITS.get(name, near)
+        if flag not in flags:
+            return f"see {self.prog} --help"
+        if flag == "--runs-dir":
+            return f"did you mean runs_dir={value or 'PATH'}?"
+        return f"did you mean {flag}{f' {value}' if value else ''}?"
