@@ -52,9 +52,8 @@ def memory(plan: Plan) -> int:
     seeds, most = min(plan.lockstep, len(plan.seeds)), 0
     for stage in plan.stages:
         env, learner = stage.env, stage.learner
-        episodes = getattr(learner, "episodes", None)
-        if episodes is None:
-            episodes = 2 * learner.evaluation_episodes
+        evaluated = 2 * getattr(learner, "evaluation_episodes", 0)
+        episodes = max(getattr(learner, "episodes", 0), evaluated)
         states = 2 * 8 * episodes * (env.horizon + 1) * env.state_dim  # and a copy
         row = 4 * (2 * env.state_dim + env.n_actions + 3)
         most = max(most, seeds * (states + row * getattr(learner, "replay_size", 0)))

@@ -24,6 +24,7 @@ from bcrl.locks import Lock, claimed
 from bcrl.loggers import Log
 from bcrl.probes import Probe
 from bcrl.progress import Tick, named
+from bcrl.rollout import success_of
 from bcrl.stage import Course, Snapshot, Team
 from bcrl.terminal import say
 
@@ -197,6 +198,7 @@ def _record(
         "interruptions": session.interruptions,
         "lockstep": list(seeds),
         "device": plan.device,
+        "success": str(success_of(plan.target)),
         "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
     for place, seed in enumerate(seeds):

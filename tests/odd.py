@@ -148,6 +148,14 @@ class NoEarlyReset(Walk):
         return seen, reward, ended, False, {}
 
 
+class WornByResets(Walk):
+    resets = 0
+
+    def first(self, seed):
+        self.resets += 1
+        return super().first(seed) if self.resets == 1 else 5
+
+
 class OrderedInfo(Walk):
     def give(self, seen, reward, ended):
         return seen, reward, ended, False, collections.OrderedDict(at=self.at)
@@ -372,12 +380,12 @@ class LateDice(Walk):
         return np.array([self.steps + noise]), -1.0, False, False, {}
 
 
-class OutlivesReset(Walk):
-    episodes = 0
+class OutlivesAll(Walk):
+    episodes = [0]  # noqa: RUF012
 
     def first(self, seed):
-        self.episodes += 1
-        return 2 + self.episodes % 3
+        self.episodes[0] += 1
+        return 2 + self.episodes[0] % 3
 
 
 class Shared(Walk):

@@ -11,10 +11,12 @@ from torch.nn import functional
 
 from bcrl import pack, runner
 from bcrl.api import DQN, FQI, Boost, Forest, Gymnasium, run, stages
+from bcrl.envs._success import default
+from bcrl.envs._trial import coarse
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.evaluation import evaluate
 from bcrl.q.quadratic import Quadratic
-from bcrl.rollout import draws, play, start_states
+from bcrl.rollout import draws, play, start_states, success_of
 from bcrl.stage import Team, snapshots
 from bcrl.streams import stream
 from bcrl.transfer import Start
@@ -360,3 +362,132 @@ def test_a_map_joins_tasks_with_different_observations(tmp_path, monkeypatch):
     assert list(found.task) == [1, 2]
     lake = Gymnasium("FrozenLake-v1", observation="my_maps.cell")
     assert lake.state_dim == 2 and lake.n_actions == 4
+
+
+class Scored(Counter):
+    """Says in info whether it is a success, which is so in some steps."""
+
+    def step(self, action):
+        seen, reward, end, cut, _ = super().step(action)
+        return seen, reward, end, cut, {"is_success": np.array([action == 8])}
+
+
+gymnasium.register("tests/Scored-v0", Scored, max_episode_steps=9)
+
+RULES = {
+    "FrozenLake-v1": ({}, "rewarded", lambda r, end, info: end and r[-1] > 0),
+    "CliffWalking-v1": ({"horizon": 40}, "absorbed", lambda r, end, info: end),
+    "CartPole-v1": ({"horizon": 25}, "survived", lambda r, end, info: not end),
+    "Acrobot-v1": ({"success": "unpunished"}, "unpunished", None),
+    "Taxi-v4": (
+        {"success_threshold": -160, "horizon": 40},
+        "threshold",
+        lambda r, end, info: sum(r) >= -160,
+    ),
+    "tests/Scored-v0": ({}, "info", lambda r, end, info: bool(info["is_success"][0])),
+}
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_what_is_solved_is_what_a_plain_loop_finds(name):
+    changes, rule, expected = RULES[name]
+    if name not in gymnasium.registry:
+        pytest.skip("of another version of Gymnasium")
+    task = Gymnasium(name, **changes)
+    assert task.success == rule
+    found = played(task, episodes=40)
+    solved = found.solved(success_of(task))[0]
+    env = gymnasium.make(name, max_episode_steps=task.horizon)
+    counted = []
+    for lane, number in enumerate(start_states(stream(0, "data", 1), task, 40)[:, 0]):
+        env.reset(seed=int(number * 2**31))
+        rewards, over = [], False
+        while not over:
+            action = found.action[0, lane, len(rewards)] + task.first_action
+            _, reward, end, cut, info = env.step(int(action))
+            rewards.append(reward)
+            over = end or cut
+        if expected is None:
+            counted.append(end and rewards[-1] >= 0)
+        else:
+            counted.append(expected(rewards, end, info))
+    assert solved.tolist() == counted
+    if name != "Acrobot-v1" and name != "CliffWalking-v1":
+        assert 0 < sum(counted) < 40 or name == "FrozenLake-v1"
+
+
+@pytest.mark.parametrize(
+    ("reports", "low", "high", "registered", "rule"),
+    [
+        (True, -1, -1, 5.0, "info"),
+        (False, -1, -1, -110.0, "absorbed"),  # MountainCar
+        (False, 1, 1, 475.0, "survived"),  # CartPole
+        (False, 0, 0, 0.7, "rewarded"),  # FrozenLake
+        (False, -10, -1, 8.0, "rewarded"),  # Taxi
+        (False, -9, -1, -3.75, "threshold"),  # Reacher
+        (False, -100, -1, None, "absorbed"),  # CliffWalking
+        (False, -3, 2, 200.0, "threshold"),  # LunarLander
+        (False, -1, 1, None, "rewarded"),  # Pong
+        (False, 0.5, 2, None, "survived"),
+    ],
+)
+def test_the_default_rule(reports, low, high, registered, rule):
+    assert default(reports, low, high, registered).rule == rule
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("MiniGrid-Empty-5x5-v0", "env.id=minigrid:MiniGrid-Empty-5x5-v0"),
+        ("ALE/Pong-v5", "env.id=ale_py:ALE/Pong-v5"),
+        ("CartPole", "env.id=CartPole-v1"),
+        ("cartpole-v1", "env.id=CartPole-v1"),
+        ("MountainCar-v9", "env.id=MountainCar-v0"),
+        ("Nothing-like-it-v0", "env.id=module:Name-v0"),
+        ("miniworld:MiniWorld-Maze-v0", "pip install miniworld"),
+    ],
+)
+def test_an_id_that_is_not_registered_gets_the_line_to_type(name, line, monkeypatch):
+    monkeypatch.delitem(gymnasium.registry, name, raising=False)
+    with pytest.raises(ConfigError) as refused:
+        Gymnasium(name)
+    assert f"env.id={name}: " in str(refused.value) and line in str(refused.value)
+
+
+def test_trusting_gymnasium_breaks_nothing(monkeypatch):
+    monkeypatch.setenv("BCRL_TRUST", "gymnasium,fqi,maze")
+    (made,) = plans("env=gymnasium", "env.id=gymnasium:CartPole-v1")
+    assert made.target.n_actions == 2
+    assert plan("env=maze").target.name == "maze"
+
+
+def test_wrappers_of_foreign_packages_need_trust():
+    for name in ("gymnasium.wrappers.RecordVideo", "gymnasium.utils.play.play"):
+        with pytest.raises(ConfigError, match=r"env\.wrappers="):
+            Gymnasium(**CAR, wrappers=[{"name": name}])
+    box = [{"name": "DiscretizeAction", "bins": [5]}]
+    pendulum = Gymnasium("Pendulum-v1", wrappers=box)
+    assert pendulum.n_actions == 5 and pendulum.state_dim == 3
+
+
+@pytest.mark.parametrize(
+    ("offset", "scale", "note"),
+    [(0.0, 1.0, False), (1.7e9, 1.0, True), (0.0, 1e-8, True), (1e3, 1e-5, True)],
+)
+def test_a_component_that_float32_does_not_resolve_is_noted(offset, scale, note):
+    cells = np.random.default_rng(0).integers(7, size=(200, 1))
+    seen = np.hstack([np.cos(cells), offset + scale * cells])
+    assert [text.split()[1] for text in coarse(seen)] == ["1"] * note
+
+
+def test_a_replay_that_ends_elsewhere_fails_its_lane():
+    task = Gymnasium("CartPole-v1", horizon=30)
+    lanes = task.lanes()
+    state = lanes.begin(np.full((3, 1), 0.25))
+    lanes.step(state, np.ones(3, int), None)
+    lanes.close()
+    lanes.seen[1] += 1e-9
+    after, *_, cut = lanes.step(state, np.ones(3, int), None)
+    assert list(lanes.failures) == [1] and "replay" in lanes.failures[1]
+    assert cut.tolist() == [False, True, False] and not after[1].any()
+    assert not lanes.restart(np.ones(3, bool), np.full((3, 1), 0.5), after)[1].any()

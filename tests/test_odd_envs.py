@@ -10,7 +10,7 @@ import pytest
 
 from bcrl import runner, vetting
 from bcrl.api import DQN, FQI, Forest, Gymnasium, run, stages
-from bcrl.errors import BcrlError, SeedsFailed
+from bcrl.errors import BcrlError
 from bcrl.rollout import rollout
 from tests import odd
 from tests.conftest import arguments, plan
@@ -37,7 +37,7 @@ SAME = (odd.RewardInAnArray, odd.NumpyScalars, odd.EverythingInArrays, odd.OneBu
 SAME += (odd.ListsForArrays, odd.Row, odd.Bare, odd.InATuple, odd.InADict)
 SAME += (odd.ActionsFrom5, odd.ModeWithoutDefault, odd.LegacySeed, odd.SignedSeed)
 SAME += (odd.NoEarlyReset, odd.OrderedInfo, odd.CloseFails, odd.HoldsAFile)
-SAME += (odd.SeedsTheGlobal, odd.BothAtOnce)
+SAME += (odd.WornByResets, odd.SeedsTheGlobal, odd.BothAtOnce)
 
 
 @pytest.mark.parametrize("cls", SAME, ids=lambda cls: cls.__name__)
@@ -48,7 +48,7 @@ def test_what_is_adapted_gives_the_numbers_of_the_plain_one(cls, plain):
 def test_dqn_takes_adapted_environments_too():
     learner = DQN(40, 10, 10, evaluate_every=20, evaluation_episodes=2)
     plain = results("Walk", learner)
-    for name in ("EverythingInArrays", "OneBuffer", "NoEarlyReset", "InADict"):
+    for name in ("EverythingInArrays", "OneBuffer", "NoEarlyReset", "WornByResets"):
         pd.testing.assert_frame_equal(results(name, learner), plain)
 
 
@@ -103,7 +103,7 @@ REFUSED = {
     odd.SeveralActions: ("actions", "MultiDiscrete", "Discrete"),
     odd.Unseeded: ("reset", "episode 1", "reset(seed=…)"),
     odd.LateDice: ("step 71", "episode 1", "reset(seed=…)"),
-    odd.OutlivesReset: ("reset", "episode 2", "outlives a reset"),
+    odd.OutlivesAll: ("reset", "episode 1", "outlives a reset"),
     odd.Shared: ("another", "expected", "share"),
     odd.Clock: ("reset", "episode 1", "same reset and actions"),
 }
@@ -184,7 +184,9 @@ def test_a_simulator_that_fails_in_a_run_fails_its_seed_alone(more, tmp_path):
         if not doom:
             runner.run(made)
         else:
-            with pytest.raises(SeedsFailed, match=r"env\.id=odd/FailsLate-v0") as lost:
+            with pytest.raises(
+                runner.SeedsFailed, match=r"env\.id=odd/FailsLate-v0"
+            ) as lost:
                 runner.run(made)
             assert "RuntimeError: the motor is stuck (…/odd.py:" in str(lost.value)
         found = sorted(made.directory.glob("seed_*.json"))

@@ -47,6 +47,11 @@ WRONG = {
     ),
 }
 DICE = iter(range(100))
+WRONG["states that grow without bound"] = (
+    changed(lambda s, r, a: (np.where(s == 4, 1e39, s), r, a)),
+    "step gives states .*float32",
+)
+WRONG["an unknown rule"] = ({"success": "info"}, "success is 'info'")
 
 
 @pytest.mark.parametrize("name", WRONG)
@@ -59,6 +64,20 @@ def test_what_is_wrong_is_said(name):
 def test_an_environment_that_is_right_passes():
     found = run(stages([variant()] * 2, LEARNER, Boost()), [0], progress=False)
     assert list(found.stage) == [1, 2]
+
+
+def test_a_parameter_has_to_have_an_effect():
+    ignored = dataclass(frozen=True)(
+        type(
+            "Mine",
+            (OpenCorridor,),
+            {"step": lambda self, *given: OpenCorridor(1.0).step(*given)},
+        )
+    )
+    with pytest.raises(ConfigError, match="behave alike"):
+        stages([ignored(prize=1.0), ignored(prize=2.0)], LEARNER)
+    ignored.verify = False
+    assert len(stages([ignored(prize=1.0), ignored(prize=2.0)], LEARNER)) == 2
 
 
 @pytest.mark.parametrize(

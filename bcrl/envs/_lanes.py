@@ -37,6 +37,8 @@ class SimulatedLanes:
     failures: dict[int, str] = field(default_factory=dict)
     running: list[Simulator | None] = field(default_factory=list, metadata=DERIVED)
     render_mode: str | None = None
+    #: Whether every episode needs a new simulator.
+    fresh: bool = field(default=False, metadata=DERIVED)
     #: (…) whether the latest info reported success
     succeeded: NDArray[np.bool_] | None = field(default=None, metadata=DERIVED)
 
@@ -124,16 +126,16 @@ class SimulatedLanes:
     def _reset(self, lane: int) -> NDArray[np.float64] | float:
         """A lane's first observation; 0 if it has failed."""
         seed = int(self.start.reshape(-1)[lane] * SEEDS)
-        if self.env.renew and lane not in self.failures and self.running[lane].used:
+        if self.fresh and lane not in self.failures and self.running[lane].used:
             self._open(lane)
-        for attempt in range(2):
+        for _ in range(2):
             if lane in self.failures:
                 break
-            simulator = self.running[lane]
+            used = self.running[lane].used
             try:
-                return simulator.reset(seed)
+                return self.running[lane].reset(seed)
             except Broken as error:
-                if attempt or not simulator.used:
+                if not used:
                     self._fail(lane, error)
                 else:  # perhaps it allows no reset before the end of an episode
                     self._open(lane)
@@ -155,7 +157,7 @@ class SimulatedLanes:
             self._fail(lane, error)
 
     def _open_all(self) -> None:
-        self.running = [None] * self.length.size
+        self.running, self.fresh = [None] * self.length.size, self.env.fresh
         self.succeeded = np.zeros(self.length.shape, bool)
         for lane in range(self.length.size):
             if lane not in self.failures:

@@ -18,7 +18,7 @@ from bcrl.envs import _simulators as simulators
 from bcrl.envs._contract import Simulator, plain_parts
 from bcrl.envs._lanes import SimulatedLanes
 from bcrl.envs._success import RULES, default
-from bcrl.envs._trial import TRIES, once, trial
+from bcrl.envs._trial import FRESH, TRIES, once, trial
 from bcrl.envs.base import check_episodes
 from bcrl.errors import BcrlError, ConfigError, at_least, did_you_mean
 
@@ -43,9 +43,8 @@ class Gymnasium:
     Tasks differ in `kwargs` of the constructor, in `attributes` set on the unwrapped
     environment, in `wrappers` ({name: …, arguments}) or in any other field.
     `starts` episodes measure each FQI iteration. `action_vectors` (A, k) say what each
-    action does, which residual policies want to know. `renew` makes a new simulator for
-    each episode, for those whose state outlives a reset. `verify=False` allows tasks
-    that random play can't tell apart. Raises ConfigError for whatever of it can't be.
+    action does, which residual policies want to know. `verify=False` allows tasks that
+    random play can't tell apart. Raises ConfigError for whatever of it can't be.
     """  # noqa: E501
 
     id: str
@@ -59,7 +58,6 @@ class Gymnasium:
     success_threshold: Any = None
     starts: int = 20
     action_vectors: Any = None
-    renew: bool = False
     verify: bool = True
 
     name: ClassVar[str] = "gymnasium"
@@ -130,7 +128,12 @@ class Gymnasium:
         return hash((self.id, self.horizon, self.gamma))  # dicts have none
 
     def __reduce__(self) -> tuple:
-        return _made, (_fields(self),)  # what is cached stays here
+        return _made, (_fields(self), self.fresh)  # what is cached stays here
+
+    @property
+    def fresh(self) -> bool:
+        """Whether every episode needs a new simulator, as random play has shown."""
+        return _measured(self) in FRESH
 
     @property
     def actions(self) -> NDArray[np.float64] | None:
@@ -208,8 +211,7 @@ class Gymnasium:
             if seen.unsteady:
                 why = f"{seen.unsteady} is another after the same reset and actions; "
                 why += "expected the same each time: randomness from reset(seed=…) "
-                why += "only, no state that outlives a reset (env.renew=true makes a "
-                why += "new simulator for each episode) or that simulators share"
+                why += "only, no state that outlives a reset or that simulators share"
                 raise ConfigError("env.id", task.id, why)
             if seen.adapted:
                 once(f"env.id={task.id}: {'; '.join(seen.adapted)}")
@@ -290,8 +292,11 @@ def _no_vector(task: Gymnasium, space: spaces.Space) -> str:
     return f"{why}env.observation=module.function makes an array of them"
 
 
-def _made(fields: dict[str, Any]) -> Gymnasium:
-    return Gymnasium(**fields)
+def _made(fields: dict[str, Any], fresh: bool) -> Gymnasium:
+    task = Gymnasium(**fields)
+    if fresh:
+        FRESH.add(_measured(task))
+    return task
 
 
 ENV = Gymnasium
