@@ -9,12 +9,15 @@ import pytest
 from bcrl import overview, shell, vetting
 
 ROOT = Path(__file__).parents[1]
+#: tests/test_other_packages.py runs this section's commands.
+OTHER_PACKAGES = r"\n## Environments of other packages\n.*?(?=\n## )"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def commands(page: Path) -> list[str]:
     """The `bcrl` lines of a page's shell blocks, continued ones whole."""
-    blocks = re.findall(r"```sh\n(.*?)```", page.read_text(), re.S)
+    text = re.sub(OTHER_PACKAGES, "", page.read_text(encoding="utf-8"), flags=re.S)
+    blocks = re.findall(r"```sh\n(.*?)```", text, re.S)
     lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
     return [line for line in lines if re.match(r"bcrl [^…<$]*$", line)]
 
