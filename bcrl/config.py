@@ -115,7 +115,7 @@ def _texts(cls: type, prefix: str) -> Iterator[str]:
 
 
 def check_launcher(section: DictConfig) -> None:
-    """Raise ConfigError for a launcher's unknown key, or a value of another type or size."""
+    """Raise ConfigError for a launcher's unknown key, or a value of another type."""
     values = OmegaConf.to_container(section, resolve=True)
     schema = LAUNCHERS.get(str(values["_target_"]).rpartition(".")[2])
     known = schema and OmegaConf.structured(schema)

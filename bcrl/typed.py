@@ -64,6 +64,8 @@ def _canonical(text: str, folders: Folders) -> Iterator[str]:
             raise ConfigError(key, raw, f"{why}: {', '.join(options(key, folders))}")
         plain = all(map(NAME.fullmatch, names))
         yield f"{head}={','.join(names if plain else map(_quoted, names))}"
+    elif isinstance(value, list) and _is_group(key, folders):
+        yield text  # no option: refused as it was typed
     elif key == "hydra.searchpath":
         yield f"{head}={_words(raw, _folder)}"
     elif (
@@ -127,9 +129,13 @@ def _folder(text: str, quoted: bool) -> str | None:
     return f"file://{os.path.abspath(path)}"
 
 
+def _is_group(key: str, folders: Folders) -> bool:
+    return any(Path(folder, key).is_dir() for folder in (CONF, *folders))
+
+
 def _is_text(key: str, folders: Folders) -> bool:
     """Whether a key's value is text by the schema, or by an option that has the key."""
-    if key in texts() or any(Path(f, key).is_dir() for f in (CONF, *folders)):
+    if key in texts() or _is_group(key, folders):
         return True
     parts = key.split(".")
     groups = ["/".join(parts[:n]) for n in range(1, len(parts))]
