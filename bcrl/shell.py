@@ -71,7 +71,8 @@ def _meant(words: Sequence[str], place: int, flags: argparse.ArgumentParser) -> 
     word, after = words[place], words[place + 1 : place + 2]
     value = after[0] if after and "=" not in after[0] and after[0][0] != "-" else None
     chosen = tuple(each for each in words if "=" in each and not each.startswith("-"))
-    near = closest(word.partition("=")[0], _names(flags), 0.7)
+    names = set(_names(flags)) - {"--runs-dir"}  # its key says as much
+    near = closest(word.partition("=")[0], names, 0.7)
     line = near or Hints(chosen).words(word, value) or guess(word, _names(flags))
     return f"did you mean {line}?" if line else "see bcrl --help"
 

@@ -38,8 +38,13 @@ def canonical(overrides: Sequence[str], folders: Folders) -> list[str]:
 
     What is canonical stays as it is.
     """
-    found = [text for override in overrides for text in _canonical(override, folders)]
-    return list(dict.fromkeys(found))
+    found: dict[str, None] = {}
+    for text in (text for each in overrides for text in _canonical(each, folders)):
+        head = text.partition("=")[0]
+        if head.startswith("seeds."):  # the last one holds
+            found = {old: None for old in found if old.partition("=")[0] != head}
+        found[text] = None
+    return list(found)
 
 
 def options(group: str, folders: Folders) -> list[str]:
@@ -141,7 +146,10 @@ def _is_text(key: str, folders: Folders) -> bool:
     groups = ["/".join(parts[:n]) for n in range(1, len(parts))]
     shipped = [keys_of_group(group, folders).get(key, {}) for group in groups]
     named = [each for found in shipped for v in found.values() for each in _parts(v)]
-    return any(isinstance(v, str) and "${" not in v for v in named)
+    # YAML reads 1e-4 as text, too.
+    return any(
+        isinstance(v, str) and "${" not in v and not NUMBER.fullmatch(v) for v in named
+    )
 
 
 def _parts(value: Any) -> list:

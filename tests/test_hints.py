@@ -28,7 +28,7 @@ WRONG = [
     (MAZE, "--scale paper", "scale=paper"),
     (MAZE, "--env.gamma 0.9", "env.gamma=0.9"),
     (MAZE, "--tag=x", "tag=x"),
-    (MAZE, "-runs_dir x", "--runs-dir x"),
+    (MAZE, "-runs_dir x", "runs_dir=x"),
     (MAZE, "--dryrun", "--dry-run"),
     (MAZE, "--dry_run", "--dry-run"),
     (MAZE, "--mutlirun", "--multirun"),
@@ -65,7 +65,7 @@ WRONG = [
     (MAZE, "lr=0.1", "algorithm=dqn algorithm.learning_rate=0.1"),
     (DQN, "lr=0.1", "algorithm.learning_rate=0.1"),
     (DQN, "learning_rate=0.1", "algorithm.learning_rate=0.1"),
-    (DQN, "buffer_size=500", "algorithm.replay_size=500"),
+    (DQN, "buffer_size=5000", "algorithm.replay_size=5000"),
     (DQN, "total_timesteps=5000", "algorithm.steps=5000"),
     (DQN, "algorithm.batchsize=16", "algorithm.batch_size=16"),
     (MAZE, "n_jobs=2", "workers=2"),
@@ -228,7 +228,7 @@ def test_seeds_are_swept_and_stand_in_files(tmp_path):
         ("seeds: [3, 7]", (3, 7)),
         ("seed: 5", (5,)),
     ):
-        place = tmp_path / text[:7].strip(": ") / "experiment"
+        place = tmp_path / str(seeds) / "experiment"
         place.mkdir(parents=True, exist_ok=True)
         (place / "mine.yaml").write_text(f"# @package _global_\n{text}\n")
         own = {"config_dir": str(place.parent)}
@@ -277,9 +277,27 @@ def test_what_only_a_job_knows_is_refused(typed):
 def test_globs_choose_options():
     swept = plans(MAZE, "boosting=glob(o*)", multirun=True)
     assert {p.name for p in swept} == {"FQI", "B-FQI"}
-    assert len(plans("experiment=glob(fig[35])", multirun=True)) == 4 + 1
+    assert len(plans("experiment=glob([fig3,fig5])", multirun=True)) == 3
     with pytest.raises(BcrlError, match=r"boosting=glob.*off, on"):
         plans(MAZE, "boosting=glob(z*)", multirun=True)
+
+
+@pytest.mark.parametrize(
+    "typed",
+    [
+        "variant=B boosting=off",
+        "variant=BC transfer=shaping",
+        "variant=plain curriculum=on",
+    ],
+)
+def test_a_variant_and_a_group_that_contradict_it_are_refused(typed):
+    chosen = typed.split()
+    with pytest.raises(BcrlError, match=f"variant=.*{chosen[1]}") as refusal:
+        plan(DQN.split()[0], DQN.split()[1], *chosen)
+    line = str(refusal.value).partition("did you mean ")[2].rstrip("?")
+    assert plan(*DQN.split(), *line.split()) and chosen[1] in line
+    agreed = plan(MAZE, "variant=BC", "boosting=on", "seeds=1")
+    assert agreed.name == "BC-FQI"
 
 
 # --- numbers of YAML 1.1, launchers' keys ---
