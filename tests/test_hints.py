@@ -277,7 +277,7 @@ def test_what_only_a_job_knows_is_refused(typed):
 def test_globs_choose_options():
     swept = plans(MAZE, "boosting=glob(o*)", multirun=True)
     assert {p.name for p in swept} == {"FQI", "B-FQI"}
-    assert len(plans("experiment=glob([fig3,fig5])", multirun=True)) == 3
+    assert len(plans("experiment=glob([fig3,fig5])", multirun=True)) == 4 + 1
     with pytest.raises(BcrlError, match=r"boosting=glob.*off, on"):
         plans(MAZE, "boosting=glob(z*)", multirun=True)
 
