@@ -56,6 +56,8 @@ def check_override(text: str) -> None:
 
 def check_file(path: Path) -> None:
     """Raise BcrlError for a YAML file that is no plain, small data in UTF-8."""
+    if not path.is_file():  # a pipe would never end
+        raise BcrlError(f"{path} is no regular file")
     if path.stat().st_size > FILE_BYTES:
         raise BcrlError(f"{path} is larger than {FILE_BYTES // 1024} KiB")
     try:
