@@ -90,6 +90,8 @@ def capped(
 def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
     """Raise ConfigError for learners that don't suit the slots, or each other."""
     n, start = len(chosen.order), chosen.start or Start()
+    if n == 1 and not start.steering:
+        chosen.check()
     if len(learners) != n:
         why = f"there are {len(learners)} learners for {n} slots"
         raise ConfigError("algorithm.learners", list(learners), why)
