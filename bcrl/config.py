@@ -77,11 +77,8 @@ def section_of_seeds(key: str, value: object) -> dict[str, Any]:
         return {"count": value} if key == "seeds" else {"count": None, "only": [value]}
     if isinstance(value, list):
         return {"count": None, "only": list(value)}
-    if (
-        isinstance(value, Mapping)
-        and key == "seeds"
-        and not {"count", "only"} <= {*value}
-    ):
+    both = isinstance(value, Mapping) and None not in map(value.get, ("count", "only"))
+    if isinstance(value, Mapping) and key == "seeds" and not both:
         return ({"count": None} if value.get("only") else {}) | dict(value)
     why = "how many (seeds=5), just these (seeds=[3,7,11]), or one (seed=3)"
     raise ConfigError(key, value, why)
@@ -117,7 +114,7 @@ def _texts(cls: type, prefix: str) -> Iterator[str]:
 
 
 def check_launcher(section: DictConfig) -> None:
-    """Raise ConfigError for a launcher's unknown key, or a value of another type or size."""
+    """Raise ConfigError for a launcher's unknown key, or a value of another type."""
     values = OmegaConf.to_container(section, resolve=True)
     schema = LAUNCHERS.get(str(values["_target_"]).rpartition(".")[2])
     known = schema and OmegaConf.structured(schema)

@@ -23,7 +23,7 @@ class ConfigError(BcrlError):
         return type(self), (self.key, self.value, self.allowed)
 
 
-class SeedsFailed(BcrlError):
+class LostSeeds(BcrlError):
     """Some seeds of a team can't go on; `reasons` says why, by place in the team."""
 
     def __init__(self, reasons: dict[int, str]) -> None:

@@ -222,9 +222,9 @@ class Hints:
             head, _, raw = typed.partition("=")
             if isinstance(value, IntervalSweep):
                 line = f"-m {head}=0.1,0.5 or -m {head}=range(0,1,0.25)"
-                yield f"{typed}: an interval is for optimisers; list values: {line}"
+                yield f"{typed}: intervals are for optimisers; did you mean {line}?"
             elif key == "hydra/sweeper" and value != "basic":
-                yield f"{typed}: the only sweeper is basic; did you mean hydra/sweeper=basic?"
+                yield f"{typed}: the only one is basic; did you mean {key}=basic?"
             elif key in ("seed", "seeds") and isinstance(value, (RangeSweep, str)):
                 yield f"{typed}: did you mean {numbers(key, raw)}?"
             elif isinstance(value, Sweep) or override.is_delete():
@@ -233,7 +233,7 @@ class Hints:
                 yield f"{typed}: did you mean {key}={VALUES[key][str(value).lower()]}?"
 
     def check(self) -> None:
-        """Raise BcrlError for a word that is no KEY=VALUE, or has another tool's value."""
+        """Raise BcrlError for a word that isn't KEY=VALUE, or another tool's value."""
         for word in self.overrides:
             check_override(word)
         for word, value in bare(self.overrides):
@@ -270,7 +270,8 @@ class Hints:
             return f"{error.key}: {why}; {self.mean(error.key, value)}"
         if typed and typed[0].startswith("~"):
             return f"{typed[0]}: there is nothing to delete; {error.key}=null"
-        parents = [key for key in self.present if error.key.startswith(f"{key}.")]
+        keys = self.present.keys() - {"seed", "seeds"}
+        parents = [key for key in keys if error.key.startswith(f"{key}.")]
         if parents:
             inner = error.key.removeprefix(f"{parents[0]}.")
             line = f"+{error.key}={value}"

@@ -15,6 +15,7 @@ from typing import NoReturn
 from hydra._internal.utils import get_args_parser
 
 from bcrl import __version__
+from bcrl.bounds import check_override
 from bcrl.composed import CONF, PACKAGE
 from bcrl.errors import BcrlError, closest, guess
 from bcrl.files import user_folder
@@ -34,6 +35,7 @@ def arguments() -> Namespace:
     for place, word in enumerate(words):
         if word == "--":
             break
+        check_override(word)
         if word.startswith("-") and not _is_flag(word, flags):
             raise BcrlError(f"{word}: unknown flag; {_meant(words, place, flags)}")
     asked = flags.parse_intermixed_args()
@@ -70,9 +72,10 @@ def _meant(words: Sequence[str], place: int, flags: argparse.ArgumentParser) -> 
     from bcrl.hints import Hints
 
     word, after = words[place], words[place + 1 : place + 2]
-    value = after[0] if after and "=" not in after[0] and after[0][0] != "-" else None
+    value = next((w for w in after if "=" not in w and not w.startswith("-")), None)
     chosen = tuple(each for each in words if "=" in each and not each.startswith("-"))
-    near = closest(word.partition("=")[0], _names(flags), 0.7)
+    names = set(_names(flags)) - {"--runs-dir"}  # its key says as much
+    near = closest(word.partition("=")[0], names, 0.7)
     line = near or Hints(chosen).words(word, value) or guess(word, _names(flags))
     return f"did you mean {line}?" if line else "see bcrl --help"
 

@@ -23,7 +23,8 @@ def ready() -> None:
                 os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
         if getattr(sys, name) is None:
             mode = "w" if number else "r"
-            stream = open(os.devnull, mode, encoding="utf-8")  # noqa: SIM115
+            # By its usual number, which processes that are started take over.
+            stream = open(number, mode, encoding="utf-8", closefd=False)  # noqa: SIM115
             setattr(sys, name, stream)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(*GONE):  # a stream of a test's or a notebook's

@@ -38,8 +38,13 @@ def canonical(overrides: Sequence[str], folders: Folders) -> list[str]:
 
     What is canonical stays as it is.
     """
-    found = [text for override in overrides for text in _canonical(override, folders)]
-    return list(dict.fromkeys(found))
+    found: dict[str, None] = {}
+    for text in (text for each in overrides for text in _canonical(each, folders)):
+        head = text.partition("=")[0]
+        if head.startswith("seeds."):  # the last one holds
+            found = {old: None for old in found if old.partition("=")[0] != head}
+        found[text] = None
+    return list(found)
 
 
 def options(group: str, folders: Folders) -> list[str]:
@@ -64,6 +69,8 @@ def _canonical(text: str, folders: Folders) -> Iterator[str]:
             raise ConfigError(key, raw, f"{why}: {', '.join(options(key, folders))}")
         plain = all(map(NAME.fullmatch, names))
         yield f"{head}={','.join(names if plain else map(_quoted, names))}"
+    elif isinstance(value, list) and _is_group(key, folders):
+        yield text  # no option: refused as it was typed
     elif key == "hydra.searchpath":
         yield f"{head}={_words(raw, _folder)}"
     elif (
@@ -127,15 +134,22 @@ def _folder(text: str, quoted: bool) -> str | None:
     return f"file://{os.path.abspath(path)}"
 
 
+def _is_group(key: str, folders: Folders) -> bool:
+    return any(Path(folder, key).is_dir() for folder in (CONF, *folders))
+
+
 def _is_text(key: str, folders: Folders) -> bool:
     """Whether a key's value is text by the schema, or by an option that has the key."""
-    if key in texts() or any(Path(f, key).is_dir() for f in (CONF, *folders)):
+    if key in texts() or _is_group(key, folders):
         return True
     parts = key.split(".")
     groups = ["/".join(parts[:n]) for n in range(1, len(parts))]
     shipped = [keys_of_group(group, folders).get(key, {}) for group in groups]
     named = [each for found in shipped for v in found.values() for each in _parts(v)]
-    return any(isinstance(v, str) and "${" not in v for v in named)
+    # YAML reads 1e-4 as text, too.
+    return any(
+        isinstance(v, str) and "${" not in v and not NUMBER.fullmatch(v) for v in named
+    )
 
 
 def _parts(value: Any) -> list:

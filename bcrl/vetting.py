@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import yaml
 from hydra.core.override_parser.types import Override, Sweep
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -193,6 +194,7 @@ def plan(job: DictConfig, hydra: DictConfig, folders: Sequence[str]) -> Plan:
     if choices["env"] == OPEN and OmegaConf.is_missing(job.env, "id"):
         raise ConfigError("env.id", "???", "name an environment: env.id=CartPole-v1")
     extra = tuple(f for f in folders if Path(f) != CONF)
+    _refuse_contradiction(choices, extra)
     config, known = _plain(job), {}
     env, named = choices["env"], ()
     if env == OPEN:
@@ -206,6 +208,26 @@ def plan(job: DictConfig, hydra: DictConfig, folders: Sequence[str]) -> Plan:
             break
     made = compose.plan(config, known, env)
     return replace(made, command=_command(hydra))
+
+
+def _refuse_contradiction(choices: Mapping[str, str], folders: Folders) -> None:
+    """Raise ConfigError for a group that is chosen otherwise than `variant` says."""
+    name = choices.get("variant")
+    places = [Path(folder, "variant", f"{name}.yaml") for folder in (CONF, *folders)]
+    found = [path for path in places if path.exists()]
+    read = yaml.safe_load(found[-1].read_text("utf-8")) if found else None
+    said = {
+        key.removeprefix("override /"): option
+        for entry in (read or {}).get("defaults") or ()
+        if isinstance(entry, dict)
+        for key, option in entry.items()
+    }
+    for group, option in said.items():
+        if choices.get(group, option) != option:
+            line = " ".join(f"{each}={choices[each]}" for each in said)
+            other = f"{group}={choices[group]}"
+            why = f"means {group}={option}, but {other} is chosen; did you mean {line}?"
+            raise ConfigError("variant", name, why)
 
 
 def _usual(config: Plain, choices: Mapping[str, str], released: bool) -> Iterator[str]:

@@ -362,8 +362,8 @@ class SeveralActions(Walk):
 
 
 class Unseeded(Walk):
-    def first(self, seed):
-        return int(np.random.default_rng().integers(2, 6))
+    def see(self):
+        return np.array([self.at + np.random.default_rng().random()])
 
 
 class LateDice(Walk):
@@ -385,7 +385,10 @@ class OutlivesAll(Walk):
 
     def first(self, seed):
         self.episodes[0] += 1
-        return 2 + self.episodes[0] % 3
+        return super().first(seed)
+
+    def see(self):
+        return np.array([float(self.at + self.episodes[0])])
 
 
 class Shared(Walk):

@@ -11,9 +11,12 @@ from tests.conftest import plans
 
 MAZE = "env=maze"
 BAD = {
-    "unknown env": (["env=maz"], ["env=maz", "did you mean maze?"]),
+    "unknown env": (["env=maz"], ["env=maz", "did you mean env=maze?"]),
     "no env": ([], ["You must specify 'env'", "maze"]),
-    "unknown regressor": ([MAZE, "algorithm/regressor=forst"], ["mean forest?"]),
+    "unknown regressor": (
+        [MAZE, "algorithm/regressor=forst"],
+        ["algorithm/regressor=forest?"],
+    ),
     "unknown preset": ([MAZE, "env.preset=relesed"], ["mean released?"]),
     "unknown metric": ([MAZE, "env.metrics=[retrun]"], ["retrun", "return"]),
     "unknown group": ([MAZE, "boostign=on"], ["boostign", "boosting"]),
@@ -24,18 +27,21 @@ BAD = {
     ),
     "another option's key": (
         [MAZE, "transfer.nu=0.9"],
-        ["transfer.nu: unknown key; transfer=policy_reuse would have it"],
+        ["transfer.nu: unknown key", "transfer=policy_reuse transfer.nu=0.9"],
     ),
     "nearly another option's key": (
         [MAZE, "algorithm.lspi.iterrations=1"],
-        ["did you mean algorithm.lspi.iterations, with algorithm=dqn?"],
+        ["did you mean algorithm=dqn algorithm.lspi.iterations=1?"],
     ),
     "another regressor's key": (
         [MAZE, "algorithm/regressor=tabular", "algorithm.regressor.trees=9"],
-        ["algorithm/regressor=forest", "would have it"],
+        ["algorithm/regressor=forest algorithm.regressor.trees=9"],
     ),
-    "a group's typo": ([MAZE, "algorithm/regresor=forest"], ["algorithm/regressor?"]),
-    "unknown experiment": (["experiment=fgi1"], ["did you mean fig1?"]),
+    "a group's typo": (
+        [MAZE, "algorithm/regresor=forest"],
+        ["algorithm/regressor=forest?"],
+    ),
+    "unknown experiment": (["experiment=fgi1"], ["did you mean experiment=fig1?"]),
     "unknown local": ([MAZE, "local=hoem"], ["local=hoem", "none"]),
     "an option with a dot": (
         [MAZE, "algorithm.regressor=tabular"],
@@ -96,7 +102,7 @@ BAD = {
         ["curriculum.foo", "unknown"],
     ),
     "deleted group": ([MAZE, "~transfer"], ["transfer", "needs a choice"]),
-    "a number for an option": ([MAZE, "algorithm=2.5"], ["algorithm=2.5", "an option"]),
+    "a number for an option": ([MAZE, "algorithm=2.5"], ["algorithm=2.5", "fqi"]),
     "a list of options": ([MAZE, "variant=[1]"], ["variant=[1]", "name an option"]),
     "metric no name": ([MAZE, "env.metrics=[[return]]"], ["env.metrics"]),
     "no searchpath": ([MAZE, "hydra.searchpath=[/no/where]"], ["/no/where"]),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bcrl import api, runner
-from bcrl.errors import BcrlError, SeedsFailed
+from bcrl.errors import BcrlError, LostSeeds
 from bcrl.evaluation import StepProbe
 from bcrl.learners.dqn import DQN
 from bcrl.learners.fqi import FQI
@@ -146,7 +146,7 @@ def test_asking_goes_on_without_the_seeds_that_fail():
     def q(states, n_actions):
         lost = {s: f"seed {s}" for s, x in enumerate(states) if len(x) and s in (0, 2)}
         if lost:
-            raise SeedsFailed(dict([next(iter(lost.items()))]))
+            raise LostSeeds(dict([next(iter(lost.items()))]))
         return [np.ones((len(x), n_actions)) for x in states]
 
     values, failed = ask(q, np.zeros((4, 5, 1)), 2)
@@ -154,9 +154,9 @@ def test_asking_goes_on_without_the_seeds_that_fail():
     assert [v.mean() for v in values] == [0, 1, 0, 1] and values[0].shape == (5, 2)
 
     def always(states, n_actions):
-        raise SeedsFailed({0: "again"})
+        raise LostSeeds({0: "again"})
 
-    with pytest.raises(SeedsFailed, match="again"):
+    with pytest.raises(LostSeeds, match="again"):
         ask(always, np.zeros((1, 1, 1)), 2)
 
 
@@ -170,7 +170,7 @@ def test_a_model_that_predicts_too_little_is_named():
     x = np.zeros((3, 1), np.float32)
     problem = Problem(x, np.zeros(3), np.ones(3, int), x, 0, (1, 1, 0))
     model = Fitted.of(problem, Fit(object(), *np.zeros((2, 3))))
-    with pytest.raises(SeedsFailed, match=r"predict.*\(2,\).*\(3,\)"):
+    with pytest.raises(LostSeeds, match=r"predict.*\(2,\).*\(3,\)"):
         Fits([[model]], Short(), team(0))([x], 1)
 
 

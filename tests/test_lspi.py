@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg
 
 from bcrl.envs.linear_system import LinearSystem
-from bcrl.errors import BcrlError
+from bcrl.errors import BcrlError, ConfigError
 from bcrl.evaluation import evaluate
 from bcrl.learners import lspi
 from bcrl.learners.lspi import LSPI, improved, lstdq
@@ -108,7 +108,8 @@ def test_the_last_gain_is_riccatis_within_a_hundredth():
 def test_the_papers_readings_learn_it_too(kind):
     learner = LSPI(noise_std=0.1**0.5, features=kind, drop_last=False)
     env = replace(LQ, preset="paper")
-    learner = replace(learner, iterations=8, steps=4000)  # half the force
+    # Half the force: four iterations leave 5 %.
+    learner = replace(learner, iterations=8, steps=4000)
     *_, final = moments(range(3), learner, env)
     best = riccati.gain(env)
     off = np.linalg.norm(gains(final, 3) - best, axis=(1, 2)) / np.linalg.norm(best)
@@ -278,3 +279,24 @@ def test_a_seed_alone_is_the_same_among_others():
             at = np.random.default_rng(0).standard_normal((5, 1, 4))
             values = one.learned.q(at[3:4], 8), among.learned.q(at, 8)
             assert np.array_equal(values[0][0], values[1][3])
+
+
+def test_the_horizon_is_the_environments():
+    short = replace(LQ, horizon=50)
+    learner = LSPI(iterations=2, steps=300)
+    *_, final = learner.learn(staged(learner, short), Start(), team(0))
+    assert learner.episodes(short) == 3 and final.count == learner.length == 300
+    for wrong in (LQ, replace(LQ, horizon=200)):  # 2 x 100 does not divide 300
+        with pytest.raises(ConfigError, match=r"algorithm\.steps=300"):
+            list(learner.learn(staged(learner, wrong), Start(), team(0)))
+
+
+def test_positions_are_where_the_environment_says():
+    class Swapped(LinearSystem):
+        positions = (1, 3)
+
+    matrix = good_matrix()
+    matrix[4, 1] = matrix[1, 4] = -matrix[4, 1]  # the gain on a velocity changes sign
+    assert improved(matrix, LQ) is not None
+    assert improved(matrix, Swapped("lq")) is None
+    assert improved(good_matrix(), Swapped("lq")) is not None

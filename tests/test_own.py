@@ -8,7 +8,15 @@ from pathlib import Path
 import pytest
 
 DOC = (Path(__file__).parents[1] / "docs" / "own.md").read_text()
-FILES = re.findall(r"```(?:python|yaml)\n# ((?:code|conf)/\S+)\n(.*?)```", DOC, re.S)
+#: Each block of a file, whole, by the path that one of its first lines names.
+FILES = [
+    (name, text)
+    for text, name in re.findall(
+        r"```(?:python|yaml)\n((?:# @[^\n]+\n)?# ((?:code|conf)/\S+)\n.*?)```",
+        DOC,
+        re.S,
+    )
+]
 COMMANDS = re.findall(r"```sh\nBCRL_TRUST=mine bcrl (.*?)\n```", DOC, re.S)
 RESULTS = {
     "env=swing_up variant=plain": ("FQI", "C-FQI", "BC-FQI"),

@@ -264,6 +264,7 @@ def test_other_seeds_than_a_checkpoints_start_by_themselves(tmp_path):
 def test_a_file_that_changes_under_a_run_is_not_the_code_that_runs(
     tmp_path, monkeypatch
 ):
+    checkpoints._code.cache_clear()
     before = checkpoints._code()
     (tmp_path / "other.py").write_text("A = 1")
     monkeypatch.setattr(checkpoints, "__file__", str(tmp_path / "checkpoints.py"))

@@ -14,6 +14,7 @@ import pytest
 
 from bcrl import runner
 from bcrl.errors import BcrlError, ConfigError
+from bcrl.learners.fqi import FQI
 from bcrl.records import is_complete
 from bcrl.stage import Team, learn
 from tests.conftest import plan
@@ -218,7 +219,12 @@ def test_a_damaged_config_is_named(tmp_path, content):
 
 def test_an_unforeseen_error_shows_where_it_came_from(tmp_path, capsys, monkeypatch):
     p = broken(tmp_path, 1)
+    # A regressor's names its line, for it fails one seed and no job.
     monkeypatch.setattr(Broken, "fit", lambda *_: 1 / 0)
+    with pytest.raises(runner.SeedsFailed, match=r"division by zero .*test_runs\.py:"):
+        runner.run(p)
+    assert "Traceback" not in capsys.readouterr().err
+    monkeypatch.setattr(FQI, "_data", lambda *_: 1 / 0)
     with pytest.raises(runner.SeedsFailed, match="ZeroDivisionError: division by zero"):
         runner.run(p)
     assert "Traceback" in capsys.readouterr().err

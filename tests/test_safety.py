@@ -145,8 +145,6 @@ BAD = {
     "a regressor's class": ["++algorithm.regressor.name=os.system"],
     "a cycle": ["tag=${device}", "device=${tag}"],
     "a cycle of sections": ["+env.x=${env}"],
-    "runs_dir": ["runs_dir=../x"],
-    "runs_dir's depth": ["runs_dir=a/../../x"],
     "home": ["runs_dir='~/x'"],
     "home, bare": ["runs_dir=~/x"],
     "a URL": ["runs_dir=file://x"],
@@ -229,6 +227,8 @@ YAMLS = {
     + "}",
     "a package too deep": "# @package " + "a." * 400 + "a\nx: 1",
     "no mapping": "[1, 2]",
+    "a folder outside": "runs_dir: ../x",
+    "a folder outside, deeper": "runs_dir: a/../../x",
     "two documents": "a: 1\n---\nb: 2",
     "a date's key": "2020-01-01: 1",
     "a null key": "env: {null: 1, 3: {_target_: os.system}}",
@@ -299,6 +299,18 @@ def test_hydras_own_options_are_allowed(kind, option):
 def test_absolute_folders_are_allowed(tmp_path):
     assert plan(MAZE, f"runs_dir={tmp_path}/../x").root == tmp_path / ".." / "x"
     assert plan(MAZE, "runs_dir=a/b").root == Path("a/b")
+
+
+def test_a_folder_that_is_typed_may_lie_outside(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for typed in ("../x", "a/../../x", "'../x'", '"../x"'):
+        assert plan(MAZE, f"runs_dir={typed}").root == tmp_path / "x"
+    swept = plans(MAZE, "runs_dir=../x,../y", "seeds=1", multirun=True)
+    assert [p.root.name for p in swept] == ["x", "y"]
+
+
+def test_threads_may_be_set():
     assert plan(MAZE, "+hydra.job.env_set.OMP_NUM_THREADS=1")
 
 

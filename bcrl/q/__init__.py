@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.envs import Env, FiniteEnv
-from bcrl.errors import BcrlError, SeedsFailed
+from bcrl.errors import BcrlError, LostSeeds
 from bcrl.pack import storable
 
 Values = Sequence[NDArray[np.float64]]
@@ -66,7 +66,7 @@ def ask(
         try:
             values = list(q(asked, n_actions))
             break
-        except SeedsFailed as error:
+        except LostSeeds as error:
             if error.reasons.keys() <= failed.keys():
                 raise
             failed |= error.reasons

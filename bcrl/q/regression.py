@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.errors import BcrlError, SeedsFailed
+from bcrl.errors import BcrlError, ConfigError, LostSeeds
 from bcrl.pack import DERIVED, storable
 from bcrl.q import Values
 from bcrl.streams import stream
@@ -110,6 +110,8 @@ def _by_seed(
     """What `do(cells)` gives; where it raises, seed by seed, and why seeds failed."""
     try:
         return dict(zip(cells, do(cells), strict=True)), {}
+    except ConfigError:  # which concerns all seeds
+        raise
     except Exception as error:  # whatever a regressor of the user's does
         seeds = dict.fromkeys(s for s, _ in cells)
         if len(seeds) == 1:
@@ -176,7 +178,7 @@ class Fits:
 
         found, failed = _by_seed(self.regressor, "predict", predict, cells)
         if failed:
-            raise SeedsFailed(failed)
+            raise LostSeeds(failed)
         out = [np.zeros((len(x), n_actions)) for x in states]
         for (s, a), values in found.items():
             out[s][:, a] = values

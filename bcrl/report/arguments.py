@@ -57,7 +57,7 @@ class Parser(argparse.ArgumentParser):
 
     def _meant(self, word: str, after: str, flags: Sequence[str]) -> str:
         """What an unknown word may mean."""
-        key, equals, value = word.lstrip("+-").partition("=")
+        key, _, value = word.lstrip("+-").partition("=")
         value, name = value or after, key.lower().replace("-", "_").rstrip(":")
         scale = closest(word, SCALES, 0.8) if "--scale" in flags else None
         if scale:
