@@ -155,7 +155,8 @@ def _check_dqn(chosen: Composition, learner: DQN, start: Start) -> None:
         why = "must be a number above 0"
         raise ConfigError("algorithm.learning_rate", learner.learning_rate, why)
     widths = learner.hidden
-    if not widths or not all(type(w) is int and w >= 1 for w in widths):
+    whole = all(isinstance(w, Integral) and w >= 1 for w in widths)
+    if not widths or not whole:
         why = "must be a list of layer widths, each at least 1"
         raise ConfigError("algorithm.hidden", list(widths), why)
     if start.initial is not ZERO and chosen.transfers != (warm_start,):

@@ -1,5 +1,6 @@
 """What an environment of the user's may get wrong is named before any work."""
 
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +52,28 @@ WRONG["states that grow without bound"] = (
     changed(lambda s, r, a: (np.where(s == 4, 1e39, s), r, a)),
     "step gives states .*float32",
 )
+WRONG["late dice"] = (
+    changed(lambda s, r, a: (s, r + (s[..., 0] == 4) * next(DICE), a)),
+    "comes in as noise",
+)
+WRONG["one buffer"] = (
+    changed(lambda s, r, a: (BUFFER.setdefault(s.shape, s), r, a)),
+    "one array again and again",
+)
+BUFFER = {}
+WRONG["no horizon"] = ({"horizon": 0}, "horizon must be a number, is 0")
+WRONG["no discount"] = ({"gamma": 1.0}, "gamma must be a number")
+WRONG["no threshold"] = ({"success": "threshold"}, "success_threshold must be")
+WRONG["no hash"] = ({"__hash__": lambda self: hash([])}, "tuple.*list")
+WRONG["no start"] = (
+    {"evaluation_states": lambda self: np.zeros((0, 1))},
+    "evaluation_states have shape",
+)
+WRONG["nothing for a start"] = (
+    {"evaluation_states": lambda self: None},
+    "evaluation_states have shape None",
+)
+WRONG["an exit"] = ({"step": lambda *_: sys.exit(3)}, "SystemExit: 3")
 WRONG["an unknown rule"] = ({"success": "info"}, "success is 'info'")
 
 
