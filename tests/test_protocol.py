@@ -61,8 +61,6 @@ WRONG["one buffer"] = (
     "one array again and again",
 )
 BUFFER = {}
-WRONG["no horizon"] = ({"horizon": 0}, "horizon must be a number, is 0")
-WRONG["no discount"] = ({"gamma": 1.0}, "gamma must be a number")
 WRONG["no threshold"] = ({"success": "threshold"}, "success_threshold must be")
 WRONG["no hash"] = ({"__hash__": lambda self: hash([])}, "tuple.*list")
 WRONG["no start"] = (
@@ -131,3 +129,29 @@ def test_an_estimator_of_scikit_learn_is_to_be_wrapped():
     bare = FQI(iterations=1, episodes=1, regressor=KNeighborsRegressor())
     with pytest.raises(ConfigError, match=r"Sklearn\(estimator\)"):
         stages([OpenCorridor()], bare)
+
+
+@pytest.mark.parametrize("values", [{"horizon": 0}, {"horizon": 3.0}, {"gamma": 1.0}])
+def test_horizon_and_discount_are_checked(values):
+    with pytest.raises(ConfigError, match=f"{next(iter(values))} must be a number"):
+        stages([OpenCorridor(**values)], LEARNER)
+
+
+def test_scripts_may_count_in_numpys_integers_and_in_generators():
+    learner = FQI(np.int64(1), np.int64(2), Forest(trees=2))
+    plain = run(stages([OpenCorridor()], LEARNER), [0], progress=False)
+    asked = (name for name in ("return", "solved"))
+    made = stages((env for env in [OpenCorridor()]), (x for x in [learner]))
+    found = run(made, np.arange(1), asked, progress=False)
+    assert found.equals(plain)
+
+
+@pytest.mark.parametrize("tasks", ["maze", [OpenCorridor], [None]])
+def test_what_is_no_environment_is_named(tasks):
+    with pytest.raises(ConfigError, match="tasks="):
+        stages(tasks, LEARNER)
+    with pytest.raises(ConfigError, match="None: is no learner"):
+        stages([OpenCorridor()], None)
+    for seeds in (np.int64(3), [0.5]):
+        with pytest.raises(ConfigError, match="seeds="):
+            run(stages([OpenCorridor()], LEARNER), seeds, progress=False)
