@@ -10,6 +10,7 @@ The same objects as behind the `bcrl` command, without configs and files:
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from numbers import Integral
 from pathlib import Path
 
 import pandas as pd
@@ -88,14 +89,16 @@ def stages(
     others = [t for t in transfers if not isinstance(t, Boost) and t is not warm_start]
     _check(tasks, transfers, max(len(boosts), len(others)))
     if curriculum is None:
-        different = [task for task in dict.fromkeys(tasks) if task != tasks[-1]]
+        earlier = [task for task in tasks if task != tasks[-1]]
+        different = [t for i, t in enumerate(earlier) if t not in earlier[:i]]
         different.append(tasks[-1])
         order = tuple(different.index(task) for task in tasks)
     else:
         different, order = tasks, order_of(curriculum, tasks)
     check_tasks(tasks[-1].name, different)
     chosen = Composition(tuple(different), order, *(boosts or [None]), *others)
-    each = [learner] * len(order) if hasattr(learner, "learn") else list(learner)
+    one = hasattr(learner, "learn") or not isinstance(learner, Iterable)
+    each = [learner] * len(order) if one else list(learner)
     try:
         return course(chosen, each)
     except ConfigError as error:  # a config's keys, where there is no config
@@ -105,6 +108,9 @@ def stages(
 
 def _check(tasks: Sequence[Env], transfers: Sequence[Transfer], most: int) -> None:
     """Raise ConfigError for arguments that no config could say."""
+    for task in tasks:
+        if isinstance(task, type) or not hasattr(task, "n_actions"):
+            raise ConfigError("tasks", task, "is no environment, such as Maze()")
     for transfer in transfers:
         if isinstance(transfer, type):
             why = f"is a class, write {transfer.__name__}()"
@@ -133,7 +139,7 @@ def run(
     BcrlError for seeds that diverge.
     """
     compiling.check()
-    seeds, target = _seeds(seeds), course[-1].env
+    seeds, metrics, target = _seeds(seeds), tuple(metrics), course[-1].env
     tasks = [*dict.fromkeys(s.env for s in course if s.env != target), target]
     if isinstance(course[-1].learner, FQI):
         probes.check(metrics, target)
@@ -152,11 +158,12 @@ def run(
 
 
 def _seeds(seeds: Iterable[int]) -> tuple[int, ...]:
-    if isinstance(seeds, int):
+    if isinstance(seeds, Integral):
         raise ConfigError("seeds", seeds, f"name them: range({seeds}) or [{seeds}]")
     found = tuple(seeds)
-    if not found or len(set(found)) < len(found) or min(found) < 0:
-        raise ConfigError("seeds", found, "must be different numbers from 0 on")
+    whole = all(isinstance(seed, Integral) for seed in found)
+    if not whole or not found or len(set(found)) < len(found) or min(found) < 0:
+        raise ConfigError("seeds", found, "must be different whole numbers from 0 on")
     return found
 
 

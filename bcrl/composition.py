@@ -100,7 +100,7 @@ class Composition:
 def composition(config: Plain, tasks: list[Env]) -> Composition:
     """The groups' choices; `check` says whether they make sense together."""
     boost, transfer = boost_of(config["boosting"]), transfer_of(config["transfer"])
-    return Composition(
+    made = Composition(
         tuple(tasks),
         order_of(config["curriculum"]["name"], tasks),
         boost,
@@ -111,6 +111,9 @@ def composition(config: Plain, tasks: list[Env]) -> Composition:
             "transfer": _option(config["transfer"]["name"], transfer),
         },
     )
+    if len(tasks) == 1 and not (made.start and made.start.steering):
+        made.check()  # before budgets, which are lists with one entry per task
+    return made
 
 
 def order_of(curriculum: object, tasks: Sequence[Env]) -> tuple[int, ...]:

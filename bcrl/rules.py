@@ -90,6 +90,8 @@ def capped(
 def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
     """Raise ConfigError for learners that don't suit the slots, or each other."""
     n, start = len(chosen.order), chosen.start or Start()
+    if n == 1 and not start.steering:
+        chosen.check()
     if len(learners) != n:
         why = f"there are {len(learners)} learners for {n} slots"
         raise ConfigError("algorithm.learners", list(learners), why)
@@ -153,7 +155,8 @@ def _check_dqn(chosen: Composition, learner: DQN, start: Start) -> None:
         why = "must be a number above 0"
         raise ConfigError("algorithm.learning_rate", learner.learning_rate, why)
     widths = learner.hidden
-    if not widths or not all(type(w) is int and w >= 1 for w in widths):
+    whole = all(isinstance(w, Integral) and w >= 1 for w in widths)
+    if not widths or not whole:
         why = "must be a list of layer widths, each at least 1"
         raise ConfigError("algorithm.hidden", list(widths), why)
     if start.initial is not ZERO and chosen.transfers != (warm_start,):

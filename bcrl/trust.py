@@ -55,13 +55,13 @@ def sources() -> list[Path]:
     for entry in _listed():
         try:
             spec = importlib.util.find_spec(entry)
-        except (ImportError, ValueError):
+        except Exception:  # of a package above it; who imports it will say so
             continue
         for folder in (spec and spec.submodule_search_locations) or ():
             found += Path(folder).rglob("*.py")
         if spec and spec.origin and not spec.submodule_search_locations:
             found.append(Path(spec.origin))
-    return sorted(found)
+    return sorted(path for path in found if path.is_file())  # not "built-in"
 
 
 def attribute(key: str, name: str, dotted: str, known: Collection[str] = ()) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import fractions
 import os
 import sys
 import tempfile
@@ -69,6 +70,11 @@ class EverythingInArrays(Walk):
         return seen, np.array([[reward]]), np.array([ended]), np.array(False), {}
 
 
+class EndsInNumbers(Walk):
+    def give(self, seen, reward, ended):
+        return seen, fractions.Fraction(reward), int(ended), np.int8(0), {}
+
+
 class OneBuffer(Walk):
     buffer = np.zeros(1)
 
@@ -106,6 +112,13 @@ class InADict(Walk):
 
     def see(self):
         return {"at": {"cell": np.array([float(self.at)])}}
+
+
+class InACoarserDict(Walk):
+    observation_space = Dict({"at": Box(-9.0, 9.0, (1,), np.int64)})
+
+    def see(self):
+        return {"at": np.array([float(self.at)])}
 
 
 class ActionsFrom5(Walk):
@@ -273,6 +286,20 @@ class KeyMissing(Walk):
 
     def see(self):
         return {"a": np.zeros(1)}
+
+
+class NoTuple(Walk):
+    observation_space = Tuple((FREE,))
+
+    def see(self):
+        return np.array(5.0)
+
+
+class NothingInside(Walk):
+    observation_space = Dict({})
+
+    def see(self):
+        return {}
 
 
 class NotANumber(Walk):

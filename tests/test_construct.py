@@ -6,6 +6,7 @@ from typing import Any, Literal, Optional, Union
 
 import pytest
 
+from bcrl import trust
 from bcrl.config import construct
 from bcrl.errors import ConfigError
 
@@ -96,3 +97,11 @@ def test_types_that_only_a_type_checker_can_find_are_not_checked():
     assert construct("part", Lazy, {"value": [1]}).value == [1]
     with pytest.raises(ConfigError, match=r"part\.valeu.*value"):
         construct("part", Lazy, {"valeu": 1})
+
+
+def test_only_files_that_are_there_count_as_trusted_sources(tmp_path, monkeypatch):
+    (tmp_path / "fails").mkdir()
+    (tmp_path / "fails" / "__init__.py").write_text("raise RuntimeError('no luck')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("BCRL_TRUST", "math,sys,fails.inside,no_such_module")
+    assert all(path.is_file() for path in trust.sources())

@@ -14,6 +14,7 @@ from bcrl.learners.dqn import DQN
 from bcrl.learners.fqi import FQI
 from bcrl.probes import Probe
 from bcrl.q import Table, ask
+from bcrl.q.estimator import ExtraTrees
 from bcrl.q.regression import Fit, Fits, Fitted, Problem
 from bcrl.q.regressors import ForestRegressor, Tabular
 from bcrl.q.scikit import Sklearn
@@ -301,3 +302,34 @@ def test_a_learner_that_yields_no_last_snapshot_is_named():
         for some in (stages[1:], stages[1:] * 2):
             with pytest.raises(BcrlError, match=r"silent.*last_of_stage"):
                 list(Course(some, team(0)))
+
+
+@dataclass(frozen=True)
+class Rude(ForestRegressor):
+    """Changes whatever it is given, after it has used it."""
+
+    def fit(self, problems, keep, threads):
+        fits = super().fit(problems, keep, threads)
+        for problem in problems:
+            for array in (problem.x, problem.y, problem.multiplicity, problem.queries):
+                array[:] = 9
+        return fits
+
+    def predict(self, models, x, threads):
+        found = super().predict(models, x, threads)
+        for array in x:
+            array[:] = 9
+        return found
+
+
+def test_a_regressor_may_change_what_it_is_given():
+    some = course(OpenCorridor(), Rude(trees=3), (0, 1), Boost())
+    for (_, rows, _), (_, expected, _) in zip(
+        some, course(OpenCorridor(), FOREST, (0, 1), Boost()), strict=True
+    ):
+        assert rows == expected
+
+
+def test_estimators_that_are_not_scikit_learns_own_are_regressors():
+    learner = FQI(2, 3, Sklearn(ExtraTrees(3)))
+    assert len(api.run(api.stages([OpenCorridor()], learner), [0], progress=False)) == 2

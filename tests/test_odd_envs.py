@@ -4,12 +4,16 @@ import gc
 import json
 import os
 
+import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
+from gymnasium import spaces
 
 from bcrl import runner, vetting
 from bcrl.api import DQN, FQI, Forest, Gymnasium, run, stages
+from bcrl.envs import Success
+from bcrl.envs._contract import Simulator
 from bcrl.errors import BcrlError
 from bcrl.rollout import rollout
 from tests import odd
@@ -37,7 +41,8 @@ SAME = (odd.RewardInAnArray, odd.NumpyScalars, odd.EverythingInArrays, odd.OneBu
 SAME += (odd.ListsForArrays, odd.Row, odd.Bare, odd.InATuple, odd.InADict)
 SAME += (odd.ActionsFrom5, odd.ModeWithoutDefault, odd.LegacySeed, odd.SignedSeed)
 SAME += (odd.NoEarlyReset, odd.OrderedInfo, odd.CloseFails, odd.HoldsAFile)
-SAME += (odd.WornByResets, odd.SeedsTheGlobal, odd.BothAtOnce)
+SAME += (odd.WornByResets, odd.SeedsTheGlobal, odd.BothAtOnce, odd.EndsInNumbers)
+SAME += (odd.InACoarserDict,)
 
 
 @pytest.mark.parametrize("cls", SAME, ids=lambda cls: cls.__name__)
@@ -84,6 +89,8 @@ REFUSED = {
     odd.NothingSeen: ("reset", "None", "numbers"),
     odd.OutOfNumbers: ("Discrete(4)", "type int", "member"),
     odd.KeyMissing: ("reset", "'a'", "'b'"),
+    odd.NoTuple: ("reset", "5.", "member of Tuple"),
+    odd.NothingInside: ("reset", "nothing", "one number"),
     odd.NotANumber: ("step", "nan", "finite"),
     odd.RewardOfNothing: ("step", "reward None", "number"),
     odd.RewardAsText: ("step", "reward '-0.5'", "number"),
@@ -214,3 +221,33 @@ def test_one_message_and_no_traceback_from_the_command(bcrl, tmp_path):
     (line,) = done.stderr.splitlines()
     assert line.startswith("bcrl: env.id=broken:Broken-v0: step gave 4 values")
     assert not (tmp_path / "runs").exists()
+
+
+def test_what_info_says_of_success_has_to_be_true_or_false():
+    simulator = Simulator(Gymnasium("odd/Walk-v0"))
+    for value, expected in ((1, True), (np.array([True]), True), (False, False)):
+        assert simulator._flag("step", {"success": value}) is expected
+        assert simulator.reports
+        simulator.reports = False
+    for value in ("no", None, 0.3, np.nan, {}):
+        assert not simulator._flag("step", {"success": value})
+        assert not simulator.reports
+
+
+def test_no_cast_hides_what_float32_cannot_tell_apart():
+    seen = np.array([1.7e9 + 3])
+    space = spaces.Dict({"time": spaces.Box(-np.inf, np.inf, (1,), np.float32)})
+    simulator = Simulator(Gymnasium("odd/Walk-v0"))
+    (found,) = simulator._parts("reset", space, {"time": seen})
+    assert found[0] == seen[0]
+
+
+def test_a_registered_threshold_of_zero_is_one():
+    gymnasium.register("odd/Zero-v0", odd.Walk, 0.0, max_episode_steps=12)
+    assert Gymnasium("odd/Zero-v0", success="threshold").success_threshold == 0.0
+    task = Gymnasium("odd/Zero-v0")
+    object.__setattr__(task, "success", "auto")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("bcrl.envs.gymnasium.default", lambda *_: Success("threshold"))
+        task._resolve_success(0.0)
+    assert (task.success, task.success_threshold) == ("threshold", 0.0)

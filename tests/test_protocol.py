@@ -1,5 +1,6 @@
 """What an environment of the user's may get wrong is named before any work."""
 
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +52,26 @@ WRONG["states that grow without bound"] = (
     changed(lambda s, r, a: (np.where(s == 4, 1e39, s), r, a)),
     "step gives states .*float32",
 )
+WRONG["late dice"] = (
+    changed(lambda s, r, a: (s, r + (s[..., 0] == 4) * next(DICE), a)),
+    "comes in as noise",
+)
+WRONG["one buffer"] = (
+    changed(lambda s, r, a: (BUFFER.setdefault(s.shape, s), r, a)),
+    "one array again and again",
+)
+BUFFER = {}
+WRONG["no threshold"] = ({"success": "threshold"}, "success_threshold must be")
+WRONG["no hash"] = ({"__hash__": lambda self: hash([])}, "tuple.*list")
+WRONG["no start"] = (
+    {"evaluation_states": lambda self: np.zeros((0, 1))},
+    "evaluation_states have shape",
+)
+WRONG["nothing for a start"] = (
+    {"evaluation_states": lambda self: None},
+    "evaluation_states have shape None",
+)
+WRONG["an exit"] = ({"step": lambda *_: sys.exit(3)}, "SystemExit: 3")
 WRONG["an unknown rule"] = ({"success": "info"}, "success is 'info'")
 
 
@@ -108,3 +129,29 @@ def test_an_estimator_of_scikit_learn_is_to_be_wrapped():
     bare = FQI(iterations=1, episodes=1, regressor=KNeighborsRegressor())
     with pytest.raises(ConfigError, match=r"Sklearn\(estimator\)"):
         stages([OpenCorridor()], bare)
+
+
+@pytest.mark.parametrize("values", [{"horizon": 0}, {"horizon": 3.0}, {"gamma": 1.0}])
+def test_horizon_and_discount_are_checked(values):
+    with pytest.raises(ConfigError, match=f"{next(iter(values))} must be a number"):
+        stages([OpenCorridor(**values)], LEARNER)
+
+
+def test_scripts_may_count_in_numpys_integers_and_in_generators():
+    learner = FQI(np.int64(1), np.int64(2), Forest(trees=2))
+    plain = run(stages([OpenCorridor()], LEARNER), [0], progress=False)
+    asked = (name for name in ("return", "solved"))
+    made = stages((env for env in [OpenCorridor()]), (x for x in [learner]))
+    found = run(made, np.arange(1), asked, progress=False)
+    assert found.equals(plain)
+
+
+@pytest.mark.parametrize("tasks", ["maze", [OpenCorridor], [None]])
+def test_what_is_no_environment_is_named(tasks):
+    with pytest.raises(ConfigError, match="tasks="):
+        stages(tasks, LEARNER)
+    with pytest.raises(ConfigError, match="None: is no learner"):
+        stages([OpenCorridor()], None)
+    for seeds in (np.int64(3), [0.5]):
+        with pytest.raises(ConfigError, match="seeds="):
+            run(stages([OpenCorridor()], LEARNER), seeds, progress=False)

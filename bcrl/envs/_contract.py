@@ -6,6 +6,7 @@ import traceback
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -115,8 +116,6 @@ class Simulator:
             method = f"env.observation={self.task.observation}"
             seen = self.call(method, self.task.map, seen)
             vector = self._array(method, seen).reshape(-1)
-            if not vector.size:
-                raise self.broken(method, "nothing", "at least one number")
         elif isinstance(self.space, spaces.Box):
             array = self._array(method, seen)
             vector = array.reshape(-1)
@@ -127,11 +126,14 @@ class Simulator:
                 text = f"observations of shape {array.shape} are taken as of shape "
                 self.adapted[f"{text}{self.space.shape}"] = None
         else:
-            self._check_members(method, self.space, seen)
-            vector = spaces.flatten(self.space, seen)
-            text = f"observations, {_short(self.space)}, are flattened to "
-            text += f"{len(vector)} numbers, as FlattenObservation does"
-            self.adapted[text] = None
+            parts = self._parts(method, self.space, seen)
+            vector = np.concatenate([np.empty(0), *parts])
+            if not self.used:
+                text = f"observations, {_short(self.space)}, are flattened to "
+                text += f"{len(vector)} numbers, as FlattenObservation does"
+                self.adapted[text] = None
+        if not vector.size:
+            raise self.broken(method, "nothing", "at least one number")
         expected = self.task.__dict__.get("state_dim", len(vector))
         if len(vector) != expected:
             why = f"{expected}, as many as after the first reset"
@@ -144,23 +146,34 @@ class Simulator:
             raise self.broken(method, _came(seen), "an array of real numbers")
         return array
 
-    def _check_members(self, method: str, space: spaces.Space, seen: Any) -> None:
-        """Raise Broken if a part of an observation is not of the part's space."""
-        if isinstance(space, (spaces.Dict, spaces.Tuple)):
-            named = isinstance(space, spaces.Dict)
-            parts = space.spaces if named else dict(enumerate(space.spaces))
-            keys = range(len(seen)) if not named and hasattr(seen, "__len__") else seen
-            if isinstance(seen, dict) != named or set(keys) != set(parts):
-                raise self.broken(method, _came(seen), f"a member of {_short(space)}")
-            for key, part in parts.items():
-                self._check_members(f"{method} [{key!r}]", part, seen[key])
-        elif isinstance(space, spaces.Box):
-            if self._array(method, seen).shape != space.shape:
+    def _parts(self, method: str, space: spaces.Space, seen: Any) -> list[NDArray]:
+        """The vectors of an observation's parts; Broken if one is not of its space."""
+        if isinstance(space, spaces.Box):
+            array = self._array(method, seen)
+            if array.shape != space.shape:
                 raise self.broken(method, _came(seen), f"shape {space.shape}")
-        elif not self.call(method, space.contains, seen):
-            raise self.broken(method, _came(seen), f"a member of {_short(space)}")
+            return [array.reshape(-1)]  # not of the Box's type, which may be coarser
+        if not isinstance(space, (spaces.Dict, spaces.Tuple)):
+            if not self.call(method, space.contains, seen):
+                raise self.broken(method, _came(seen), f"a member of {_short(space)}")
+            return [self.call(method, spaces.flatten, space, seen)]
+        named = isinstance(space, spaces.Dict)
+        if isinstance(seen, np.ndarray) and seen.ndim:
+            seen = tuple(seen)
+        if isinstance(seen, dict if named else (tuple, list)):
+            keys = seen.keys() if named else range(len(seen))
+            inner = space.spaces if named else dict(enumerate(space.spaces))
+            if set(keys) == set(inner):
+                found = (
+                    self._parts(f"{method} [{key!r}]", part, seen[key])
+                    for key, part in inner.items()
+                )
+                return [vector for vectors in found for vector in vectors]
+        raise self.broken(method, _came(seen), f"a member of {_short(space)}")
 
     def _number(self, reward: Any) -> float:
+        if isinstance(reward, Real):
+            return self.call("step's reward", float, reward)
         array = self.call("step's reward", np.asarray, reward)
         if array.dtype.kind not in "biuf" or array.size != 1:
             raise self.broken("step", f"reward {_came(reward)}", "one real number")
@@ -171,10 +184,10 @@ class Simulator:
 
     def _boolean(self, name: str, value: Any) -> bool:
         array = self.call(f"step's {name}", np.asarray, value)
-        if array.dtype.kind != "b" or array.size != 1:
+        if array.size != 1 or not _true_or_false(array):
             raise self.broken("step", f"{name} {_came(value)}", "True or False")
-        if array.ndim:
-            text = f"{name}, arrays of shape {array.shape}, are taken as booleans"
+        if array.ndim or array.dtype.kind != "b":
+            text = f"{name}, {_kind(array)}, are taken as booleans"
             self.adapted[text] = None
         return bool(array.reshape(-1)[0])
 
@@ -184,8 +197,10 @@ class Simulator:
             raise self.broken(method, f"info {_came(info)}", "a dict as the last value")
         for key in KEYS:
             if key in info:
-                self.reports = True
-                return bool(np.all(info[key]))
+                value = self.call(f'{method}\'s info["{key}"]', np.asarray, info[key])
+                if _true_or_false(value):  # a rate, a text or None says nothing
+                    self.reports = True
+                    return bool(value.all())
         return False
 
 
@@ -196,6 +211,15 @@ def plain_parts(space: spaces.Space) -> bool:
     if isinstance(space, spaces.Tuple):
         return all(map(plain_parts, space.spaces))
     return isinstance(space, PLAIN)
+
+
+def _true_or_false(array: NDArray) -> bool:
+    """Whether all entries are booleans, or the numbers 0 and 1."""
+    return array.dtype.kind in "biuf" and bool(((array == 0) | (array == 1)).all())
+
+
+def _kind(array: NDArray) -> str:
+    return f"arrays of shape {array.shape}" if array.ndim else f"{array.dtype} numbers"
 
 
 def _close(env: gymnasium.Env) -> None:

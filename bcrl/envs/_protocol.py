@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,7 @@ from bcrl.errors import ConfigError, did_you_mean
 
 LANES = (2, 3)  # leading axes of the states that it is tried on
 EPISODES, STEPS = 64, 200  # in which two tasks have to differ
-NUMBERS = ("n_actions", "state_dim", "initial_noise", "step_noise")
+NUMBERS = ("n_actions", "state_dim", "horizon", "initial_noise", "step_noise")
 
 
 def check_tasks(name: str, tasks: Sequence[Env]) -> None:
@@ -41,20 +43,20 @@ def check_tasks(name: str, tasks: Sequence[Env]) -> None:
 
 def _play(name: str, env: Env) -> list[tuple]:
     """States, rewards and ends of random episodes side by side, each step's."""
+
+    def wrong(why: str) -> ConfigError:
+        return ConfigError("env.name", name, why)
+
     rng = np.random.default_rng(0)
     state = np.asarray(env.initial(rng.random((EPISODES, env.initial_noise))), float)
     trace = [(state,)]
     for _ in range(min(env.horizon, STEPS)):
         action = rng.integers(env.n_actions, size=len(state))
         noise = rng.random((len(state), env.step_noise))
-        try:
-            state, reward, absorbing = env.step(state, action, noise)
-        except Exception as error:  # whatever the user's code does
-            raise ConfigError("env.name", name, _raised("step", error)) from error
+        state, reward, absorbing = _same(wrong, "step", env.step, state, action, noise)
         if not (np.abs(state) <= LARGEST).all() or not np.isfinite(reward).all():
             why = "step gives states or rewards that are not finite in random play, or "
-            why += f"states above {LARGEST:.3g} (float32's largest number)"
-            raise ConfigError("env.name", name, why)
+            raise wrong(f"{why}states above {LARGEST:.3g} (float32's largest number)")
         trace.append((state, reward, absorbing))
         state = state[~absorbing]
         if not len(state):
@@ -62,7 +64,7 @@ def _play(name: str, env: Env) -> list[tuple]:
     return trace
 
 
-def _raised(method: str, error: Exception) -> str:
+def _raised(method: str, error: BaseException) -> str:
     return f"{method} failed: {type(error).__name__}: {error} ({place_of(error)})"
 
 
@@ -76,9 +78,21 @@ def check(name: str, env: Env) -> None:
         value = getattr(env, number, None)
         if type(value) is not int or value < (0 if number.endswith("noise") else 1):
             raise wrong(f"{number} must be a number, is {value!r} (docs/own.md)")
+    gamma = getattr(env, "gamma", None)
+    if not isinstance(gamma, Real) or not 0.0 <= gamma < 1.0:
+        raise wrong(f"gamma must be a number in [0, 1), is {gamma!r}")
+    try:
+        hash(env)
+    except TypeError as error:
+        why = "must be a frozen dataclass of values that never change, which "
+        raise wrong(f"{why}tuple[float, ...] takes from a list ({error})") from error
     rules = [rule for rule in RULES if rule != "info"]
     if (rule := getattr(env, "success", "unpunished")) not in rules:
         raise wrong(f"success is {rule!r}; {did_you_mean(str(rule), rules)}")
+    threshold = getattr(env, "success_threshold", None)
+    if rule == "threshold" and not isinstance(threshold, Real):
+        why = "must be the return that counts as solved"
+        raise wrong(f"success_threshold {why}, is {threshold!r}")
     rng = np.random.default_rng(0)
     start = rng.random((*LANES, env.initial_noise))
     noise = rng.random((*LANES, env.step_noise))
@@ -99,30 +113,37 @@ def check(name: str, env: Env) -> None:
     ):
         _check(wrong, f"step: {what}", value, expected, kinds)
     states = _same(wrong, "evaluation_states", env.evaluation_states)
-    _check(wrong, "evaluation_states", states, (len(states), env.state_dim), "fiu")
+    n = len(states) if np.ndim(states) else 0
+    _check(wrong, "evaluation_states", states, (max(n, 1), env.state_dim), "fiu")
 
 
 def _same(wrong: Callable, name: str, function: Callable, *arguments: Any) -> Any:
     """What a function gives, twice the same, its arguments left as they were."""
     before = [np.copy(argument) for argument in arguments]
     try:
-        first, again = function(*arguments), function(*arguments)
-    except Exception as error:  # whatever the user's code does
+        first = function(*arguments)
+        kept, again = copy.deepcopy(first), function(*arguments)
+    except (Exception, SystemExit) as error:  # whatever the user's code does
         raise wrong(_raised(name, error)) from error
     if not all(map(np.array_equal, arguments, before)):
         raise wrong(f"{name} changes its arguments; it must make new arrays")
-    pairs = zip(
-        *[x if isinstance(x, tuple) else (x,) for x in (first, again)], strict=True
-    )
-    if not all(_alike(a, b) for a, b in pairs):
+    found = [x if isinstance(x, tuple) else (x,) for x in (kept, again)]
+    if len(found[0]) != len(found[1]) or not all(map(_alike, *found)):
         why = "must depend on its arguments only; randomness comes in as noise"
         raise wrong(f"{name} gives something else the second time: it {why}")
+    outputs = zip(first, again, strict=True) if isinstance(first, tuple) else ()
+    shared = (a is b and getattr(a, "flags", None) for a, b in outputs)
+    if any(flags and flags.writeable for flags in shared):
+        raise wrong(f"{name} gives one array again and again; it must make new ones")
     return first
 
 
 def _alike(a: Any, b: Any) -> bool:
     """Whether two values are the same to the bit; what is no array is seen later."""
-    a, b = np.asarray(a), np.asarray(b)
+    try:
+        a, b = np.asarray(a), np.asarray(b)
+    except ValueError:  # no array can be made of it
+        return True
     return a.dtype.hasobject or a.tobytes() == b.tobytes()
 
 
@@ -131,7 +152,7 @@ def _check(wrong: Callable, what: str, value: Any, shape: tuple, kinds: str) -> 
     found = getattr(value, "shape", None)
     if found != shape:
         raise wrong(f"{what} have shape {found}, expected {shape}")
-    if value.dtype.kind not in kinds:
+    if getattr(value.dtype, "kind", None) not in kinds:  # of other libraries, too
         noun = "booleans" if kinds == "b" else "numbers"
         raise wrong(f"{what} must be {noun}, are {value.dtype}")
     if kinds != "b" and not np.isfinite(value).all():

@@ -6,6 +6,7 @@ import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
+from numbers import Integral, Real
 from typing import Any, ClassVar
 
 import gymnasium
@@ -78,9 +79,9 @@ class Gymnasium:
         if horizon is None and (horizon := spec.max_episode_steps) is None:
             why = f"is needed: {self.id} has no limit of its own (a number of steps)"
             raise ConfigError("env.horizon", None, why)
-        if type(horizon) is not int:
+        if not isinstance(horizon, Integral) or isinstance(horizon, bool):
             raise ConfigError("env.horizon", horizon, "must be an integer, or null")
-        object.__setattr__(self, "horizon", horizon)
+        object.__setattr__(self, "horizon", horizon := int(horizon))
         check_episodes(self.gamma, horizon)
         self._resolve_success(spec.reward_threshold)
         for name, value in _facts(_measured(self)).items():
@@ -95,7 +96,8 @@ class Gymnasium:
             why = did_you_mean(str(rule), (*RULES, "auto"))
             raise ConfigError("env.success", rule, why)
         if threshold is not None:
-            if type(threshold) not in (int, float) or not np.isfinite(threshold):
+            number = isinstance(threshold, Real) and not isinstance(threshold, bool)
+            if not number or not np.isfinite(threshold):
                 why = "must be a number, the return that counts as solved, or null"
                 raise ConfigError("env.success_threshold", threshold, why)
             if rule not in ("auto", "threshold"):
@@ -109,7 +111,7 @@ class Gymnasium:
         elif rule == "auto":
             seen = trial(_measured(self))
             found = default(seen.reports, seen.low, seen.high, registered)
-            rule, threshold = found.rule, found.threshold or None
+            rule, threshold = found
             once(f"env.id={self.id}: solved is env.success={found}")
         threshold = None if rule != "threshold" else float(threshold)
         object.__setattr__(self, "success", rule)
@@ -117,7 +119,9 @@ class Gymnasium:
 
     def _check_vectors(self) -> None:
         try:
-            fits = np.array(self.action_vectors, float).shape[:1] == (self.n_actions,)
+            vectors = np.array(self.action_vectors, float)
+            fits = vectors.ndim == 2 and len(vectors) == self.n_actions
+            fits = fits and vectors.size > 0 and np.isfinite(vectors).all()
         except (TypeError, ValueError):
             fits = False
         if not fits:

@@ -90,7 +90,7 @@ def fit_each(
 
     def fit(cells: list[Cell]) -> list[Fit]:
         asked = [problems[cell] for cell in cells]
-        fits = regressor.fit(asked, keep, threads)
+        fits = regressor.fit(list(map(_copied, asked)), keep, threads)
         for problem, found in zip(asked, fits, strict=True):
             for values, x in (
                 (found.fitted, problem.x),
@@ -122,6 +122,12 @@ def _by_seed(
         some, lost = _by_seed(regressor, what, do, own)
         found, failed = found | some, failed | lost
     return found, failed
+
+
+def _copied(problem: Problem) -> Problem:
+    """The same problem in arrays of its own, which a regressor may change."""
+    arrays = ("x", "y", "multiplicity", "queries")
+    return replace(problem, **{name: getattr(problem, name).copy() for name in arrays})
 
 
 def _check_shape(values: Any, n: int) -> None:
@@ -170,7 +176,7 @@ class Fits:
 
         def predict(cells: list[Cell]) -> list[NDArray[np.float64]]:
             models = [self.models[s][a].model for s, a in cells]
-            asked = [states[s] for s, _ in cells]
+            asked = [states[s].copy() for s, _ in cells]  # which it may change
             found = self.regressor.predict(models, asked, self.team.threads)
             for x, values in zip(asked, found, strict=True):
                 _check_shape(values, len(x))
@@ -189,6 +195,8 @@ class Fits:
         lost = [f for row in self.models for f in row if f and f.model is None]
         if lost:
             problems = [fitted.problem for fitted in lost]
-            fits = self.regressor.fit(problems, True, self.team.threads)
+            fits = self.regressor.fit(
+                list(map(_copied, problems)), True, self.team.threads
+            )
             for fitted, fit in zip(lost, fits, strict=True):
                 fitted.model = fit.model

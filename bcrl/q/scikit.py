@@ -87,7 +87,7 @@ class Sklearn(_Fitting):
                 raise ConfigError(place, value, did_you_mean(key, known))
         states = {k: seed for k in known if k.split("__")[-1] == "random_state"}
         made.set_params(**states | arguments)
-        if hasattr(made, "_validate_params"):  # else it would wait for the first fit
+        if hasattr(made, "_parameter_constraints"):  # or they wait for the first fit
             made._validate_params()
         return make_pipeline(StandardScaler(), made) if self.standardise else made
 
