@@ -221,7 +221,8 @@ class Hints:
             typed = override.input_line
             head, _, raw = typed.partition("=")
             if isinstance(value, IntervalSweep):
-                line = f"-m {head}=0.1,0.5 or -m {head}=range(0,1,0.25)"
+                some = ",".join(self.groups.get(key, ())[:2])
+                line = f"-m {head}={some or '0.1,0.5'}"
                 yield f"{typed}: intervals are for optimisers; did you mean {line}?"
             elif key == "hydra/sweeper" and value != "basic":
                 yield f"{typed}: the only one is basic; did you mean {key}=basic?"

@@ -188,7 +188,7 @@ def test_a_simulators_episode_is_played_once_more(tmp_path):
     assert len(shown) == len(actions) + 1
     env = made.target.simulator("rgb_array")
     (start,) = variant.arrays(0, "trajectory_start")
-    env.reset(seed=int(start[0] * 2**53))
+    env.reset(seed=int(start[0] * 2**31))
     for action, picture in zip(actions, shown[1:], strict=True):
         env.step(action)
         np.testing.assert_array_equal(picture, env.render())

@@ -185,7 +185,7 @@ BAD = {
     "reuse of nothing": (["transfer=policy_reuse"], "needs an earlier task"),
     "residual policy of nothing": (["transfer=residual_policy"], "an earlier task"),
     "residual policy and boosting": (
-        ["variant=RPL", "boosting=on"],
+        ["curriculum=on", "transfer=residual_policy", "boosting=on"],
         "residual_policy: its Q is about its own actions",
     ),
     "LSPI on the target": (
@@ -202,7 +202,7 @@ BAD = {
     ),
     "unknown learner": (["algorithm.learners=dqm"], "did you mean dqn?"),
     "unknown device": (["device=gpu"], "device=gpu"),
-    "unknown transfer": (["transfer=shapin"], "did you mean shaping?"),
+    "unknown transfer": (["transfer=shapin"], "did you mean transfer=shaping?"),
     "nu": (["variant=PPR", "transfer.nu=1.5"], "transfer.nu=1.5"),
     "offset": (["variant=RPL", "transfer.offset=-1"], "transfer.offset=-1"),
     "switch": (["boosting=on", "boosting.maxima=three"], "boosting.maxima=three"),
