@@ -257,6 +257,10 @@ def _plain(job: DictConfig) -> Plain:
         plain = OmegaConf.to_container(ours, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
         raise BcrlError(first_lines(error)) from error
+    for key in Config.__annotations__.keys() & set(VARIANT_GROUPS):
+        if not isinstance(plain[key], dict):  # a file's `boosting: 'on'`
+            why = f"is a section; an option stands in defaults: [override /{key}: …]"
+            raise ConfigError(key, plain[key], why)
     for key, value in flat(plain).items():  # tag=${env.gamma}
         if key in texts() and not isinstance(value, str | None):
             raise ConfigError(key, value, "must be text: add some to the ${…}")
