@@ -28,6 +28,7 @@ UNKNOWN = re.compile(
     r"Could not override '([^']+)'|Could not append.* already at '([^']+)'"
     r"|Could not delete from config\. '([^']+)' does not exist"
     r"|Multiple values for ([^.\s]+)\."
+    r"|In '[^']*': ConfigKeyError .* Key '([^']+)' not in 'Config'"
 )
 NO_ENV = "You must specify 'env'"
 Folders = tuple[str, ...]  # of configs, besides our own
@@ -68,7 +69,8 @@ def composed(name: str, overrides: tuple[str, ...], folders: Folders) -> DictCon
             raise BcrlError(
                 f"{key}: unknown key; one that isn't there is added with +{key}"
             )
-        raise Unknown(f"{key}: unknown key", key)
+        text = message if message.startswith("In ") else f"{key}: unknown key"
+        raise Unknown(text, key)
     if message.startswith(NO_ENV):
         raise Unknown(message, "env")
     raise BcrlError(message)

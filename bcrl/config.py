@@ -73,9 +73,9 @@ def register() -> None:
 
 def section_of_seeds(key: str, value: object) -> dict[str, Any]:
     """`seeds=5`, `seeds=[3,7]` and `seed=3` as keys of the section `seeds`."""
-    if type(value) is int:
+    if type(value) is int or (isinstance(value, str) and value.startswith("${")):
         return {"count": value} if key == "seeds" else {"count": None, "only": [value]}
-    if isinstance(value, list):
+    if isinstance(value, list) and not any(isinstance(x, (list, dict)) for x in value):
         return {"count": None, "only": list(value)}
     both = isinstance(value, Mapping) and None not in map(value.get, ("count", "only"))
     if isinstance(value, Mapping) and key == "seeds" and not both:
@@ -86,8 +86,11 @@ def section_of_seeds(key: str, value: object) -> dict[str, Any]:
 
 def seeds_of(config: Any) -> None:
     """Write a file's `seeds: 5`, `seeds: [3, 7]` or `seed: 3` as the section's keys."""
+    there = config if isinstance(config, DictConfig) else {}
+    if None not in (there.get("seed"), there.get("seeds")):
+        raise ConfigError("seed", there["seed"], "seeds is given, too; keep one")
     for key in ("seed", "seeds"):
-        if isinstance(config, DictConfig) and config.get(key) is not None:
+        if there.get(key) is not None:
             value = OmegaConf.to_container(config, resolve=False).pop(key)
             del config[key]
             config["seeds"] = section_of_seeds(key, value)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -165,6 +166,8 @@ class Hints:
         if key in ("seeds", "seed"):
             return numbers(key, value)
         option = "" if key in self.present else f"{next(iter(self.brought[key]))} "
+        usual = self.present.get(key, "…")  # where none was typed
+        value = value or {None: "null", "???": "…"}.get(usual, usual)
         return f"{option}{key}={value}"
 
     def _option_of_any(self, word: str) -> str | None:
@@ -226,7 +229,11 @@ class Hints:
                 yield f"{typed}: intervals are for optimisers; did you mean {line}?"
             elif key == "hydra/sweeper" and value != "basic":
                 yield f"{typed}: the only one is basic; did you mean {key}=basic?"
-            elif key in ("seed", "seeds") and isinstance(value, (RangeSweep, str)):
+            elif (
+                key in ("seed", "seeds")
+                and isinstance(value, (RangeSweep, str))
+                and not raw.startswith("${")
+            ):
                 yield f"{typed}: did you mean {numbers(key, raw)}?"
             elif isinstance(value, Sweep) or override.is_delete():
                 continue
@@ -243,6 +250,18 @@ class Hints:
             )
         for message in self.refusals(self._parsed()):
             raise BcrlError(message)
+
+    def swept(self) -> str:
+        """What to say of several values without -m."""
+        several = [o for o in parse(self.overrides) if o.is_sweep_override()]
+        first = several[0].input_line
+        line = shlex.join(["bcrl", "-m", *self.overrides])
+        text = f"{first}: several values are a sweep; add -m: {line}"
+        if several[0].key_or_group in ("seed", "seeds"):  # more likely one run of them
+            text = (
+                f"{first}: did you mean {numbers('seeds', first)}? If a sweep: {line}"
+            )
+        return text
 
     def _parsed(self) -> Iterator[Override]:
         """The overrides; BcrlError for one that can't be read."""
@@ -266,6 +285,13 @@ class Hints:
             return self.without_env()
         typed = [o for o in self.overrides if o.lstrip("+~").startswith(error.key)]
         value = typed[-1].partition("=")[2] if typed else ""
+        if file := re.match(r"In '([^']*)'", str(error)):
+            line = (self.words(error.key, "") or "").split(" ")[-1].partition("=")[0]
+            nested = ": {".join(line.split(".")) + ": …" + "}" * line.count(".")
+            if error.key in self.groups:
+                nested = f"defaults: [override /{error.key}: …]"
+            meant = f"did you mean {nested}?" if line else "see bcrl --help"
+            return f"{error.key}: unknown key in {file[1]}; {meant}"
         if error.key in self.groups:
             why = "needs no +" if typed[-1][0] == "+" else "is chosen twice"
             return f"{error.key}: {why}; {self.mean(error.key, value)}"
@@ -291,16 +317,20 @@ class Hints:
             known = {*self.groups, *self.present, *self.brought}
             if key not in known and not key.startswith(("+", "~", "hydra")):
                 return f"{key}: unknown key; {self.mean(key, value)}"
+            if self.brought.get(key) and key not in self.present:
+                return f"{key}: needs its env; {self.mean(key, value)}"
         known = ", ".join(self.groups["env"])
         return f"env: You must specify 'env', such as env=maze; known: {known}"
 
     def of_option(self, group: str, value: object) -> str:
         """`did you mean env=maze?`, and the options where they are few."""
-        if group == "env" and (line := self.gymnasium(str(value))):
+        if group[:3] == "env" and (line := self.gymnasium(str(value))):
             return f"did you mean {line}?"
         near, known = self.option(group, value), self.groups.get(group, ())
         if near and group == "variant" and str(value).upper().endswith("-DQN"):
             near += " algorithm=dqn"
+        if not known:
+            return f"{group} is no group; see bcrl --help"
         listed = f"known: {', '.join(known)}" if len(known) <= 12 or not near else ""
         said = f"did you mean {group}={near}?" if near else ""
         return f"{said} ({listed})" if said and listed else said or listed
@@ -313,7 +343,7 @@ class Hints:
 
 def numbers(key: str, value: str) -> str:
     """`seeds=5` or `seeds=[3,4,5]` for the ways in which people write ranges."""
-    found = [int(number) for number in re.findall(r"\d{1,6}", value)]
+    found = [int(number) for number in re.findall(r"\b\d{1,6}\b", value)]
     if "range" in value and len(found) == 1:
         return f"seeds={found[0]}"
     dashed = re.fullmatch(

@@ -100,7 +100,7 @@ def check(composed: DictConfig) -> None:
     for key in PATHS:
         value = _resolved(composed, key)
         if value is not None:
-            check_path(key, value)
+            check_path(key, str(value))
 
 
 def check_name(key: str, text: str) -> None:

@@ -8,6 +8,7 @@ import sys
 import textwrap
 from argparse import Namespace
 from collections.abc import Sequence
+from itertools import takewhile
 from pathlib import Path
 from string import Template
 from typing import NoReturn
@@ -17,7 +18,7 @@ from hydra._internal.utils import get_args_parser
 from bcrl import __version__
 from bcrl.bounds import check_override
 from bcrl.composed import CONF, PACKAGE
-from bcrl.errors import BcrlError, closest, guess
+from bcrl.errors import BcrlError, closest
 from bcrl.files import user_folder
 
 HELP = PACKAGE / "help.txt"
@@ -71,12 +72,15 @@ def _meant(words: Sequence[str], place: int, flags: argparse.ArgumentParser) -> 
     """What a flag that there isn't probably means."""
     from bcrl.hints import Hints
 
-    word, after = words[place], words[place + 1 : place + 2]
-    value = next((w for w in after if "=" not in w and not w.startswith("-")), None)
+    word = words[place]
+    follow = takewhile(lambda w: "=" not in w and w[:1] != "-", words[place + 1 :])
+    value = next(follow, None)
+    if value and value.isdecimal():  # --seeds 0 1 2
+        value = " ".join([value, *takewhile(str.isdecimal, follow)])
     chosen = tuple(each for each in words if "=" in each and not each.startswith("-"))
     names = set(_names(flags)) - {"--runs-dir"}  # its key says as much
     near = closest(word.partition("=")[0], names, 0.7)
-    line = near or Hints(chosen).words(word, value) or guess(word, _names(flags))
+    line = near or Hints(chosen).words(word, value) or closest(word, names, 0.6)
     return f"did you mean {line}?" if line else "see bcrl --help"
 
 

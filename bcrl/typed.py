@@ -27,7 +27,7 @@ WORD = re.compile(
     r"|(?P<bare>(?:\$\{[^{}]*\}|[^,\[\](){}'\"$]|\$(?!\{))+)"
 )
 #: Functions whose arguments are no names, and what Hydra may take for a number.
-CHOICE = re.compile(r"^\s*choice\((.*)\)\s*$")
+CHOICE = re.compile(r"^\s*(?:choice\((.*)\)|(?:shuffle|sort)\(([^()=]*)\))\s*$")
 NOW = re.compile(r"\$\{now:([^{}]*)\}")
 COMPUTED = re.compile(r"\s*(range|interval|glob|int|float|bool|str|json_str)\s*\(")
 NUMBER = re.compile(r"[+-]?[\d.][\w.+-]*|[+-]?(nan|inf)|true|false", re.IGNORECASE)
@@ -61,8 +61,10 @@ def _canonical(text: str, folders: Folders) -> Iterator[str]:
     if override.is_delete() or not equals:
         yield text
     elif key in ("seed", "seeds") or (key == "seeds.only" and value is not None):
-        yield from _seeds(key.partition(".")[0], value, raw)
+        yield from _seeds(key, value, raw)
     elif isinstance(value, Glob):
+        if not _is_group(key, folders):
+            raise ConfigError(key, raw, "glob(…) picks options of a group; list values")
         names = value.filter(options(key, folders))
         if not names:
             why = f"matches none of {key}'s options"
@@ -77,7 +79,7 @@ def _canonical(text: str, folders: Folders) -> Iterator[str]:
         not COMPUTED.match(raw)
         and (
             named := _words(
-                CHOICE.sub(r"\1", raw), _within if key == "runs_dir" else _name
+                CHOICE.sub(r"\1\2", raw), _within if key == "runs_dir" else _name
             )
         )
         != raw

@@ -17,10 +17,10 @@ from omegaconf.errors import OmegaConfBaseException
 from bcrl import compose, safety
 from bcrl.compose import Plan
 from bcrl.composed import CONF, CONFIG_NAME, Folders, Unknown, composed
-from bcrl.config import check_launcher
+from bcrl.config import Config, check_launcher, texts
 from bcrl.errors import BcrlError, ConfigError, guess
 from bcrl.hints import Hints
-from bcrl.identity import Plain, differences
+from bcrl.identity import Plain, differences, flat
 from bcrl.sweeps import experiments, first_lines, over_experiments, parse, product
 from bcrl.typed import canonical, options
 
@@ -128,7 +128,7 @@ def _composed(arguments: Namespace) -> tuple[Folders, list[DictConfig]]:
         return folders, [
             composed(name, tuple(job), folders)
             for overrides in experiments(parsed, multirun)
-            for job in _jobs(name, overrides, multirun, folders)
+            for job in _jobs(name, overrides, hints, multirun, folders)
         ]
     except Unknown as error:
         raise BcrlError(hints.explained(error)) from error
@@ -155,6 +155,8 @@ def _refuse_nonsense(
             raise BcrlError(f"{key}: given twice; Hydra would merge the values")
         if override.is_delete() and key in VARIANT_GROUPS:
             raise BcrlError(f"{key}: every run needs a choice of it")
+        if override.is_delete() and key in Config.__annotations__:
+            raise BcrlError(f"~{key}: can't be deleted; leave it out for its default")
         if key == "tuned":
             raise BcrlError(f"{key}: follows from the other choices; override its keys")
         value = override.value()
@@ -225,8 +227,11 @@ def _refuse_contradiction(choices: Mapping[str, str], folders: Folders) -> None:
     for group, option in said.items():
         if choices.get(group, option) != option:
             line = " ".join(f"{each}={choices[each]}" for each in said)
-            other = f"{group}={choices[group]}"
-            why = f"means {group}={option}, but {other} is chosen; did you mean {line}?"
+            other = f"{group}={choices[group]} is chosen"
+            if experiment := choices.get("experiment"):  # which sweeps over it
+                other = f"experiment={experiment} sweeps over {group}"
+                line = f"env={choices['env']} variant={name} without the experiment"
+            why = f"means {group}={option}, but {other}; did you mean {line}?"
             raise ConfigError("variant", name, why)
 
 
@@ -249,24 +254,40 @@ def _usual(config: Plain, choices: Mapping[str, str], released: bool) -> Iterato
 def _plain(job: DictConfig) -> Plain:
     ours = OmegaConf.masked_copy(job, [k for k in job if k != "hydra"])
     try:
-        return OmegaConf.to_container(ours, resolve=True, throw_on_missing=True)
+        plain = OmegaConf.to_container(ours, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
         raise BcrlError(first_lines(error)) from error
+    for key in Config.__annotations__.keys() & set(VARIANT_GROUPS):
+        if not isinstance(plain[key], dict):  # a file's `boosting: 'on'`
+            why = f"is a section; an option stands in defaults: [override /{key}: …]"
+            raise ConfigError(key, plain[key], why)
+    for key, value in flat(plain).items():  # tag=${env.gamma}
+        if key in texts() and not isinstance(value, str | None):
+            raise ConfigError(key, value, "must be text: add some to the ${…}")
+    return plain
 
 
 def _jobs(
-    name: str, overrides: list[Override], multirun: bool, folders: Folders
+    name: str,
+    overrides: list[Override],
+    hints: Hints,
+    multirun: bool,
+    folders: Folders,
 ) -> list[list[str]]:
     """Each job's overrides: the product of what the command line and config sweep."""
     jobs = product(overrides)
     first = composed(name, tuple(jobs[0]), folders).hydra
     if not multirun and first.mode != RunMode.MULTIRUN:
-        swept = [o.input_line for o in overrides if o.is_sweep_override()]
-        if swept:
-            line = shlex.join(["bcrl", "-m", *(o.input_line for o in overrides)])
-            raise BcrlError(f"{swept[0]}: several values are a sweep; add -m: {line}")
+        if any(o.is_sweep_override() for o in overrides):
+            raise BcrlError(hints.swept())
         return jobs
     params = [f"{k}={v}" for k, v in (first.sweeper.get("params") or {}).items()]
+    if (meant := canonical(params, folders)) != params:  # Hydra takes them as they are
+        written = ", ".join(
+            f"{k}: '{v}'" for k, _, v in (m.partition("=") for m in meant)
+        )
+        text = f"write {{{written}}} instead of {{{', '.join(params)}}}"
+        raise BcrlError(f"hydra.sweeper.params: {text}")
     return product(parse(params) + overrides)
 
 

@@ -120,6 +120,12 @@ WRONG = [
     (MAZE, "seeds=range(5)", "seeds=5"),
     (MAZE, "seeds=range(2,5)", "seeds=[2,3,4]"),
     (MAZE, "seeds=many", "seeds=5"),
+    (MAZE, "seeds=1,2,3", "seeds=[1,2,3]"),
+    (MAZE, "--seeds 0 1 2", "seeds=[0,1,2]"),
+    (MAZE, "tag=", "tag=null"),
+    ("", "env.id=CartPole-v1", CART),
+    ("", "env=gymnasium/CartPole-v1", CART),
+    ("", "experiment=fig1 variant=BC", "env=car_on_hill variant=BC"),
     ("-m " + MAZE, "hydra/sweeper=optuna", "hydra/sweeper=basic"),
     ("-m " + MAZE, "env.gamma=interval(0,1)", "env.gamma=0.1,0.5"),
 ]
@@ -206,6 +212,9 @@ def test_a_name_stays_what_was_typed(name):
         (["seed=3"], (3,)),
         (["seed=[4,2]"], (2, 4)),
         (["seeds.only=[3,7]"], (3, 7)),
+        (["seeds.only=3"], (3,)),
+        (["seed=${oc.env:NONE_SUCH,3}"], (3,)),
+        (["seeds=${workers}", "workers=2"], (0, 1)),
         (["seeds={first: 4, count: 2}"], (4, 5)),
         (["seeds=4", "seeds.first=10"], range(10, 14)),
         (["seeds=[3,7,11]", "seeds.part=2/3"], (7,)),
@@ -242,11 +251,44 @@ def test_seeds_are_swept_and_stand_in_files(tmp_path):
 
 @pytest.mark.parametrize(
     "typed",
-    ["seeds=0", "seeds=[]", "seeds=[3,3]", "seeds=[-1]", "seeds=true", "seed=1.5"],
+    [
+        "~seeds",
+        "seeds=[[1]]",
+        "seeds=0",
+        "seeds=[]",
+        "seeds=[3,3]",
+        "seeds=[-1]",
+        "seeds=true",
+        "seed=1.5",
+    ],
 )
 def test_seeds_that_are_none_are_refused(typed):
     with pytest.raises(BcrlError, match="seed"):
         plan(MAZE, typed)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("tag: '1e3,2e3'", '"1e3","2e3"'),
+        ("seed: '1,2'", "seeds.only: '[1],[2]'"),
+        ("boosting: glob(o*)", "boosting: 'off,on'"),
+    ],
+)
+def test_a_sweep_in_a_file_that_hydra_reads_otherwise_is_refused(text, said, tmp_path):
+    (tmp_path / "experiment").mkdir()
+    whole = "# @package _global_\nhydra: {mode: MULTIRUN, sweeper: {params: {%s}}}\n"
+    (tmp_path / "experiment" / "mine.yaml").write_text(whole % text)
+    with pytest.raises(BcrlError) as refusal:
+        plans(MAZE, "experiment=mine", config_dir=str(tmp_path))
+    assert said in str(refusal.value)
+
+
+def test_what_is_no_text_is_no_name():
+    swept = plans(MAZE, "tag=shuffle(1e3,2e3)", "seeds=1", multirun=True)
+    assert {p.name for p in swept} == {"FQI@1e3", "FQI@2e3"}
+    with pytest.raises(BcrlError, match=r"tag=0\.99"):
+        plan(MAZE, "tag=${env.gamma}")
 
 
 # --- one time, one folder ---
@@ -314,6 +356,11 @@ def test_a_variant_and_a_group_that_contradict_it_are_refused(typed):
         ("transfer: off", ["off"]),
         ("tag: 1e3", ["tag=1000.0"]),
         ("tag: 12", ["tag=12"]),
+        ("evn: {gamma: 0.9}", ["evn", "env: …"]),
+        ("env.gamma: 0.9", ["env: {gamma: …}"]),
+        ("boosting: 'on'", ["boosting"]),
+        ("variant: BC", ["defaults: [override /variant: …]"]),
+        ("seed: 2\nseeds: 3", ["seed=2", "seeds"]),
         ("scale: {name: 7}", ["scale.name=7"]),
     ],
 )

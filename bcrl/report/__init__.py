@@ -7,5 +7,8 @@ import os
 _asked = os.environ.pop("MPLBACKEND", None)
 try:
     import matplotlib  # noqa: F401
+except UnicodeDecodeError as error:
+    text = "mend or remove it (in this folder, or in ~/.config/matplotlib)"
+    raise SystemExit(f"bcrl: matplotlibrc isn't UTF-8: {text}") from error
 finally:
     os.environ.update({} if _asked is None else {"MPLBACKEND": _asked})
