@@ -2,20 +2,19 @@
 
 numba keeps an index and numbered files and trusts both: half a file stops every run
 until somebody removes it, and a process killed between the two leaves an index that
-names older code. Here each file says what it holds and is sealed by its hash. A damaged
-one counts as absent; what can't be written, or has no folder, is compiled again.
+names older code. Here each file is sealed by a hash of it and of what it belongs to. A
+damaged one counts as absent; what can't be written, or has no folder, is compiled
+again.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import itertools
 import os
-import pickle
 from collections.abc import Iterator
 from functools import partial
-from typing import Any
+from typing import IO, Any
 
 import numba
 from numba import guvectorize
@@ -32,53 +31,51 @@ SEAL = hashlib.sha256().digest_size  # bytes at a file's end
 
 
 class Files(caching.IndexDataCacheFile):
-    """What is kept of one function: a file for each signature and processor."""
-
-    def __init__(self, cache_path: str, filename_base: str, source_stamp: Any) -> None:
-        super().__init__(cache_path, filename_base, source_stamp)
-        self._stem, self._source = filename_base, (self._version, source_stamp)
+    """numba's files of one function, each with a seal at its end, which numba skips."""
 
     def load(self, key: Any) -> Any:
         """The compiled code that was kept under this key, or None."""
-        for _, about, data in self._kept():
-            if about == (*self._source, key):
-                return pickle.loads(data)
-        return None
+        self._key = key
+        try:
+            return super().load(key)
+        except Exception:  # sealed by another version of numba, perhaps
+            return None
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep code, in place of a damaged or outdated file or in a new one."""
-        mine = (*self._source, key)
-        content = self._dump((mine, self._dump(data)))
-        for path, about, _ in self._kept():
-            if about is None or about == mine or about[:2] != self._source:
-                with contextlib.suppress(OSError):
-                    with self._open_for_write(path) as file:
-                        file.write(content + hashlib.sha256(content).digest())
-                    return
+        """Keep code, in place of what is damaged or outdated."""
+        self._key = key
+        with contextlib.suppress(OSError):  # what can't be kept is compiled again
+            super().save(key, data)
 
-    def flush(self) -> None:
-        """Nothing: what is outdated is never asked for."""
+    def _load_index(self) -> dict:
+        return super()._load_index() if self._is_whole(self._index_path) else {}
 
-    def _kept(self) -> Iterator[tuple[str, Any, Any]]:
-        """Each file's path, what it holds and its code; the last is yet to be made."""
-        for number in itertools.count(1):
-            path = os.path.join(self._cache_path, f"{self._stem}.sealed{number}.nbc")
-            yield path, *_read(path)
-            if not os.path.lexists(path):
-                return
+    def _load_data(self, name: str) -> Any:
+        if not self._is_whole(self._data_path(name)):
+            raise OSError(f"{name} is damaged, or holds other code")
+        return super()._load_data(name)
 
+    @contextlib.contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[IO[bytes]]:
+        with super()._open_for_write(filepath) as file:
+            yield file
+            file.flush()
+            with open(file.name, "rb") as written:
+                file.write(self._seal(filepath, written.read()))
 
-def _read(path: str) -> tuple[Any, Any]:
-    """What a file holds and its code, None and None if it isn't as it was written."""
-    try:
-        with open(path, "rb") as file:
-            stored = file.read()
-        content, seal = stored[:-SEAL], stored[-SEAL:]
-        if hashlib.sha256(content).digest() == seal:
-            return pickle.loads(content)
-    except Exception:  # of another version of numba, perhaps: pickles raise anything
-        pass
-    return None, None
+    def _is_whole(self, path: str) -> bool:
+        try:
+            with open(path, "rb") as file:
+                stored = file.read()
+        except OSError:
+            return False
+        return stored[-SEAL:] == self._seal(path, stored[:-SEAL])
+
+    def _seal(self, path: str, content: bytes) -> bytes:
+        """A hash of a file, and of the source and the key that its code belongs to."""
+        key = None if path == self._index_path else self._key
+        about = repr((self._version, self._source_stamp, key)).encode()
+        return hashlib.sha256(content + about).digest()
 
 
 class Nowhere(caching._CacheLocator):

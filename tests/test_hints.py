@@ -465,8 +465,9 @@ def test_modules_run_as_the_commands_do(module, words, code, tmp_path):
 
 def test_ctrl_c_at_the_start_is_silent(tmp_path):
     # A shell's background jobs, and so perhaps the tests, ignore the signal.
-    program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    program += "import sys; sys.argv[0] = 'bcrl'; import bcrl; print('up', flush=True)\n"
+    program = "import signal as s; s.signal(s.SIGINT, s.default_int_handler)\n"
+    program += "import sys; sys.argv[0] = 'bcrl'\n"
+    program += "import bcrl; print('up', flush=True)\n"
     program += "from bcrl.cli import main; import time; time.sleep(9); main()"
     process = subprocess.Popen(
         [sys.executable, "-c", program, "env=maze"],

@@ -285,7 +285,8 @@ def test_the_horizon_is_the_environments():
     short = replace(LQ, horizon=50)
     learner = LSPI(iterations=2, steps=300)
     *_, final = learner.learn(staged(learner, short), Start(), team(0))
-    assert learner.episodes_per_iteration(short) == 3 and final.count == learner.length == 300
+    assert learner.episodes_per_iteration(short) == 3
+    assert final.count == learner.length == 300
     for wrong in (LQ, replace(LQ, horizon=200)):  # 2 x 100 does not divide 300
         with pytest.raises(ConfigError, match=r"algorithm\.steps=300"):
             list(learner.learn(staged(learner, wrong), Start(), team(0)))
