@@ -14,7 +14,8 @@ from bcrl.envs import Env, Success, is_finite, is_simulated, lanes_of
 from bcrl.policies import greedy, uniform, walk
 from bcrl.q import NOT_FINITE, Q, Table, ask, rows_of
 
-AT_ONCE = 128  # simulators that exist at a time in `play`
+AT_ONCE = 128  # simulators that exist at a time in `play`,
+EPISODES = 32  # of which so many have the same seed
 CHOICES = 3  # uniforms a step-wise decision takes: explore? which action? the prior's
 
 
@@ -122,9 +123,11 @@ def play(
 ) -> Episodes:
     """Episodes from start (S, E, d); the last of u (S, T, E, …) are the env's noise."""
     n_seeds, n_episodes, _ = start.shape
-    part = max(1, AT_ONCE // n_seeds)
-    if is_simulated(env) and n_episodes > part:
-        return _in_parts(env, policy, start, u, part)
+    # Which rows Q is asked for together must not depend on the number of seeds.
+    episodes = min(EPISODES, AT_ONCE)
+    seeds = AT_ONCE // episodes
+    if is_simulated(env) and (n_episodes > episodes or n_seeds > seeds):
+        return _in_parts(env, policy, start, u, seeds, episodes)
     horizon, noise = u.shape[1], u.shape[-1] - env.step_noise
     lanes_of_a_step = (horizon, n_seeds, n_episodes)  # what is written at once is close
     running = lanes_of(env)
@@ -164,32 +167,38 @@ def play(
 
 
 def _in_parts(
-    env: Env, policy: Policy, start: NDArray, u: NDArray, size: int
+    env: Env, policy: Policy, start: NDArray, u: NDArray, seeds: int, episodes: int
 ) -> Episodes:
-    """`play`, with so many episodes of each seed at a time.
+    """`play`, with so many seeds and episodes of each at a time.
 
     The policy sees the arrays of all of them, and so decides as it would for all.
     """
-    played = []
-    for first in range(0, start.shape[1], size):
-        part = slice(first, first + size)
 
-        def decide(*own: NDArray, part: slice = part) -> NDArray:
-            whole = []
-            for x in own:  # states, uniforms, alive
-                shape = (len(x), start.shape[1], *x.shape[2:])
-                whole.append(np.zeros(shape, x.dtype))
-                whole[-1][:, part] = x
-            return policy(*whole)[:, part]
+    def part(seed: int, episode: int) -> Episodes:
+        at = np.s_[seed : seed + seeds, episode : episode + episodes]
 
-        played.append(play(env, decide, start[:, part], u[:, :, part]))
-    joined = {}
+        def decide(*own: NDArray) -> NDArray:  # states, uniforms, alive
+            whole = [np.zeros((*start.shape[:2], *x.shape[2:]), x.dtype) for x in own]
+            for everything, x in zip(whole, own, strict=True):
+                everything[at] = x
+            return policy(*whole)[at]
+
+        played = play(env, decide, start[at], u[at[0], :, at[1]])
+        failed = {seed + place: why for place, why in played.failed.items()}
+        return replace(played, failed=failed)
+
+    n_seeds, n_episodes, _ = start.shape
+    grid = [
+        [part(seed, episode) for episode in range(0, n_episodes, episodes)]
+        for seed in range(0, n_seeds, seeds)
+    ]
+    joined: dict = {}
     for name in (each.name for each in fields(Episodes)):
-        values = [getattr(each, name) for each in played]
-        if isinstance(values[0], dict):  # by seed
-            joined[name] = dict(ChainMap(*values))
-        elif values[0] is not None:
-            joined[name] = np.concatenate(values, 1)
+        values = [[getattr(each, name) for each in row] for row in grid]
+        if isinstance(values[0][0], dict):  # by seed
+            joined[name] = dict(ChainMap(*(each for row in values for each in row)))
+        elif values[0][0] is not None:
+            joined[name] = np.concatenate([np.concatenate(row, 1) for row in values])
     return Episodes(**joined)
 
 
