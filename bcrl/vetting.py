@@ -231,8 +231,8 @@ def _refuse_contradiction(choices: Mapping[str, str], folders: Folders) -> None:
             if experiment := choices.get("experiment"):  # which sweeps over it
                 other = f"experiment={experiment} sweeps over {group}"
                 line = f"env={choices['env']} variant={name} without the experiment"
-            why = f"means {group}={option}, but {other}; did you mean {line}?"
-            raise ConfigError("variant", name, why)
+            why = f"means {group}={option}, but {other}; leave one of them out, "
+            raise ConfigError("variant", name, f"{why}or did you mean {line}?")
 
 
 def _usual(config: Plain, choices: Mapping[str, str], released: bool) -> Iterator[str]:

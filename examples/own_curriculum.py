@@ -14,7 +14,7 @@ tasks = [
     Gymnasium("MountainCar-v0", attributes={"force": force}, starts=5)
     for force in forces
 ]
-learner = FQI(iterations=8, episodes=100, epsilon=0.3, regressor=Forest(trees=20))
+learner = FQI(iterations=15, episodes=100, epsilon=0.3, regressor=Forest(trees=20))
 methods = {
     "FQI": stages(tasks[-1:] * 4, learner),
     "C-FQI": stages(tasks, learner),
