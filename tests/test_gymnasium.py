@@ -12,7 +12,7 @@ from torch.nn import functional
 from bcrl import pack, runner
 from bcrl.api import DQN, FQI, Boost, Forest, Gymnasium, run, stages
 from bcrl.envs._success import default
-from bcrl.envs._trial import coarse
+from bcrl.envs._trial import coarse, trial
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.evaluation import evaluate
 from bcrl.q.quadratic import Quadratic
@@ -491,3 +491,9 @@ def test_a_replay_that_ends_elsewhere_fails_its_lane():
     assert list(lanes.failures) == [1] and "replay" in lanes.failures[1]
     assert cut.tolist() == [False, True, False] and not after[1].any()
     assert not lanes.restart(np.ones(3, bool), np.full((3, 1), 0.5), after)[1].any()
+
+
+def test_what_is_flattened_is_said_by_the_wrappers_name():
+    (said,) = trial(Gymnasium("FrozenLake-v1")).adapted
+    assert "Discrete(16)" in said and "FlattenObservation" in said
+    assert trial(Gymnasium("CartPole-v1")).adapted == ()

@@ -61,8 +61,9 @@ class Simulator:
             raise self.broken("reset", _counted(found), why)
         seen, info = found
         self._flag("reset", info)
+        first = self._observed("reset", seen)
         self.used = True
-        return self._observed("reset", seen)
+        return first
 
     def step(self, action: int) -> tuple[NDArray[np.float64], float, bool, bool, bool]:
         """Observation (d,), reward, terminated, truncated, and reported success."""
