@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from bcrl.learning.replay import Replay
-from bcrl.q import compiled
+from bcrl.q.networks import cpu
 from bcrl.q.networks.mlp import DeepQ, Networks
 
 #: (places (T, S, B), next states (S, d)) → losses (S,), and the network's values (S, A)
@@ -65,8 +65,8 @@ def one_by_one(deep: DeepQ, replay: Replay) -> Update:
         adam, loss = deep.optimiser.next_step(), np.empty(len(online))
         ahead = np.empty((len(online), replay.n_actions), np.float32)
         if len(places) > 1:
-            compiled.renew_ahead(target, sizes, *kept, replay.size, places, layout)
-        compiled.update(
+            cpu.renew_ahead(target, sizes, *kept, replay.size, places, layout)
+        cpu.update(
             online,
             target,
             moments,

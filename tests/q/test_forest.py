@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -15,7 +9,6 @@ from sklearn.ensemble import ExtraTreesRegressor
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from bcrl.errors import BcrlError, ConfigError
-from bcrl.q.forest.descend import TOGETHER
 from bcrl.q.forest.estimator import ExtraTrees
 from bcrl.q.forest.forest import (
     Forest,
@@ -25,6 +18,7 @@ from bcrl.q.forest.forest import (
     join,
     predict_forests,
 )
+from bcrl.q.forest.predict import TOGETHER
 
 PAPER = TreeSettings(min_samples_split=5, min_samples_leaf=2)
 SEEDS = 200  # forests per side of a comparison
@@ -450,35 +444,3 @@ def test_points_that_are_none_or_too_large_are_refused_as_by_scikit_learn():
         for model in (ours, theirs):
             with np.errstate(all="ignore"), pytest.raises(ValueError):
                 model.predict(points)
-
-
-def test_a_plain_processor_grows_the_same_trees():
-    """Without AVX-512 rows move one by one; the forests are the same bytes."""
-    code = (
-        "import tests.test_forest as t, hashlib\n"
-        "print(hashlib.sha256(t.grown_bytes()).hexdigest())"
-    )
-    plain = dict(os.environ, NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="")
-    root = Path(__file__).parents[2]
-    found = subprocess.run(
-        [sys.executable, "-c", code],
-        env=plain,
-        cwd=root,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert found.stdout.strip() == hashlib.sha256(grown_bytes()).hexdigest()
-
-
-def grown_bytes() -> bytes:
-    """Trees and predictions of forests with and without multiplicities."""
-    rng = np.random.default_rng(11)
-    x = rng.normal(size=(700, 2)).astype(np.float32)
-    y, counts = np.sin(3 * x[:, 0]) + x[:, 1], rng.integers(1, 5, 700)
-    tasks = [Regression(x, y, seeds(5), how, x[::3] / 2) for how in (None, counts)]
-    parts = [
-        (fit.forest.nodes, fit.forest.values, fit.fitted, fit.queried)
-        for fit in fit_forests(tasks, PAPER)
-    ]
-    return b"".join(array.tobytes() for part in parts for array in part)
