@@ -57,28 +57,17 @@ def batched(deep: DeepQ, replay: Replay) -> Update:
 def one_by_one(deep: DeepQ, replay: Replay) -> Update:
     """One seed after the other in compiled code."""
     buffers = (deep.online.flat, deep.target.flat, deep.optimiser.moments)
-    online, target, moments = (buffer.numpy() for buffer in buffers)
+    networks = tuple(buffer.numpy() for buffer in buffers)
     sizes, layout = np.array(deep.online.sizes), (replay.d, replay.n_actions)
     kept = (replay.rows.numpy(), replay.bootstrap, replay.known)
 
     def update(places: NDArray, states: NDArray) -> tuple[NDArray, NDArray]:
-        adam, loss = deep.optimiser.next_step(), np.empty(len(online))
-        ahead = np.empty((len(online), replay.n_actions), np.float32)
+        adam, loss = deep.optimiser.next_step(), np.empty(len(networks[0]))
+        ahead = np.empty((len(loss), replay.n_actions), np.float32)
         if len(places) > 1:
-            cpu.renew_ahead(target, sizes, *kept, replay.size, places, layout)
-        cpu.update(
-            online,
-            target,
-            moments,
-            sizes,
-            *kept,
-            places[0],
-            layout,
-            adam,
-            states.astype(np.float32),
-            loss,
-            ahead,
-        )
+            cpu.renew_ahead(networks[1], sizes, kept, replay.size, places, layout)
+        now = states.astype(np.float32)
+        cpu.update(networks, sizes, kept, places[0], layout, adam, now, loss, ahead)
         return loss, ahead
 
     return update

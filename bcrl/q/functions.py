@@ -18,7 +18,7 @@ NOT_FINITE = "Q is not finite"  # why a seed failed
 
 
 class Q(Protocol):
-    """Q-functions of S seeds, each evaluated at states of its own.
+    """Q-functions of S seeds; each seed has its own states.
 
     The S arrays of states may be one stacked array (S, n, d); then the values are
     stacked, too.

@@ -62,7 +62,7 @@ class Regression:
 
 @dataclass(frozen=True)
 class Forest:
-    """The trees of a forest, packed one after the other: 16 bytes a node.
+    """The trees of a forest, packed one after the other: 16 bytes per node.
 
     nodes: (N,) of `split.NODE`; values: (leaves,) float64; first: (T+1,) int64,
     where each tree begins; depths: (T,) int64, 0 for a tree that is a single leaf.

@@ -23,7 +23,7 @@ from bcrl.q.networks.tiles import tiled_product
 #: Magnitude below which Adam's moments become 0. The moments of a unit that is never on
 #: would fade into denormal numbers, which processors handle many times more slowly.
 FADED = np.float32(1e-30)
-AHEAD = 64  # rows per forward pass of the target network in `renew_ahead`
+_AHEAD = 64  # rows per forward pass of the target network in `renew_ahead`
 
 _compiled = numba.njit(nogil=True, error_model="numpy")
 _entry_point = kept(nogil=True, error_model="numpy")
@@ -131,13 +131,16 @@ def _transpose(matrix, out):
     fastmath={"reassoc", "nsz", "arcp", "contract", "afn", "ninf"},
 )
 def _adam_step(parameters, first, second, gradient, constants):
-    """A step of Adam (Kingma and Ba 2015, algorithm 1) on arrays (P,), in place."""
-    beta1, rest1, beta2, rest2, rate, scale, eps = constants
+    """A step of Adam on arrays (P,), in place; constants: of `mlp.Adam.next_step`."""
+    beta1, beta2, alpha, correction, epsilon = constants
+    b1, b2 = np.float32(beta1), np.float32(beta2)
+    rate, scale, eps = np.float32(alpha), np.float32(correction), np.float32(epsilon)
+    rest1, rest2 = np.float32(1.0 - beta1), np.float32(1.0 - beta2)
     zero = np.float32(0.0)
     for i in range(len(parameters)):
         g = gradient[i]
-        m = rest1 * g + beta1 * first[i]
-        v = beta2 * second[i] + rest2 * g * g
+        m = rest1 * g + b1 * first[i]
+        v = b2 * second[i] + rest2 * g * g
         m = zero if abs(m) <= FADED else m
         v = zero if v <= FADED else v
         first[i], second[i] = m, v
@@ -189,12 +192,13 @@ def outputs(flat, sizes, x):
 
 
 @_compiled
-def _fill_bootstrap(target, sizes, rows, bootstrap, valid, indices, layout, todo, work):
+def _fill_bootstrap(target, sizes, replay, indices, layout, todo, work):
     """Compute one seed's missing bootstrap values max_a' (ϱ + base)(s') at `indices`.
 
-    rows, bootstrap and valid are the seed's part of a `Replay`; `todo` (n,) and `work`,
-    made for n inputs, are overwritten: the target is evaluated at up to n rows at once.
+    replay: the seed's rows, bootstrap and valid; `todo` (n,) and `work`, made for n
+    inputs, are overwritten, because the target is evaluated at up to n rows at once.
     """
+    rows, bootstrap, valid = replay
     d, n_actions = layout
     n, last = 0, len(indices) - 1
     for i in range(len(indices)):
@@ -216,54 +220,34 @@ def _fill_bootstrap(target, sizes, rows, bootstrap, valid, indices, layout, todo
 
 
 @_entry_point
-def renew_ahead(target, sizes, rows, bootstrap, valid, held, indices, layout):
+def renew_ahead(target, sizes, replay, held, indices, layout):
     """Compute the bootstrap values of S seeds for batches `indices` (T, S, B) to come.
 
     This needs fewer and larger passes than batch by batch. Indices of rows that are not
     among the first `held` rows yet are left out.
     """
-    work, todo = _workspace(sizes, AHEAD), np.empty(AHEAD, np.int64)
+    work, todo = _workspace(sizes, _AHEAD), np.empty(_AHEAD, np.int64)
+    rows, bootstrap, valid = replay
     for s in range(len(target)):
-        own = indices[:, s].copy().reshape(-1)
-        own = own[own < held]
-        seed = (rows[s], bootstrap[s], valid[s])
-        _fill_bootstrap(target[s], sizes, *seed, own, layout, todo, work)
+        batches = indices[:, s].copy().reshape(-1)
+        batches = batches[batches < held]
+        own = rows[s], bootstrap[s], valid[s]
+        _fill_bootstrap(target[s], sizes, own, batches, layout, todo, work)
 
 
 @_entry_point
-def update(
-    online,
-    target,
-    moments,
-    sizes,
-    rows,
-    bootstrap,
-    valid,
-    indices,
-    layout,
-    constants,
-    states,
-    loss,
-    next_values,
-):
+def update(networks, sizes, replay, indices, layout, adam, states, loss, next_values):
     """Make one DQN update of S seeds in place and put each mean loss into `loss` (S,).
 
-    online, target (S, P); moments (2, S, P); rows (S, capacity, width), bootstrap and
-    valid (S, capacity) of a `Replay`; indices (S, B) of each seed's batch; layout: d
-    and A; constants: those of `Adam.next_step`. While the new parameters are in the
-    cache, `next_values` (S, A) gets the network's outputs at the next states (S, d).
+    networks: online and target parameters (S, P) and moments (2, S, P); replay: rows
+    (S, capacity, width), bootstrap and valid (S, capacity) of a `Replay`; indices
+    (S, B) of each seed's batch; layout: d and A; adam: from `Adam.next_step`. While the
+    new parameters are in the cache, `next_values` (S, A) gets the network's outputs at
+    the next states (S, d).
     """
     d, n_actions = layout
-    beta1, beta2, rate, scale, eps = constants
-    adam = (
-        np.float32(beta1),
-        np.float32(1.0 - beta1),
-        np.float32(beta2),
-        np.float32(1.0 - beta2),
-        np.float32(rate),
-        np.float32(scale),
-        np.float32(eps),
-    )
+    online, target, moments = networks
+    rows, bootstrap, valid = replay
     n_seeds, n = indices.shape
     work, todo = _workspace(sizes, n), np.empty(n, np.int64)
     units, values_at_one = np.empty((2, sizes.max() + 1), np.float32)
@@ -271,8 +255,8 @@ def update(
     slopes, fixed = work.slopes[-1], 2 * d + n_actions
     for s in range(n_seeds):
         held, value, batch = rows[s], bootstrap[s], indices[s]
-        seed = (held, value, valid[s])
-        _fill_bootstrap(target[s], sizes, *seed, batch, layout, todo, work)
+        own = held, value, valid[s]
+        _fill_bootstrap(target[s], sizes, own, batch, layout, todo, work)
         for b in range(n):
             work.units[0, :d, b] = held[batch[b], :d]
         values = _forward(online[s], sizes, work, n)

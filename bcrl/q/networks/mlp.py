@@ -69,7 +69,7 @@ class Networks:
         return views
 
     def clone(self) -> Networks:
-        """Networks with the same parameters in a buffer of their own."""
+        """Networks with copies of the parameters."""
         return Networks(self.sizes, self.flat.clone())
 
     def forward(self, x: Tensor) -> Tensor:
@@ -128,7 +128,7 @@ class Adam:
         return cls(parameters.new_zeros((2, *parameters.shape)), rate)
 
     def clone(self) -> Adam:
-        """The same moments and step count in a buffer of their own."""
+        """The same step count and copies of the moments."""
         return replace(self, moments=self.moments.clone())
 
     def next_step(self) -> tuple[float, float, float, float, float]:

@@ -33,7 +33,7 @@ class _Fitting(ABC):
     def _model(self, seed: int) -> Any: ...
 
     def fit(self, problems: Sequence[Problem], keep: bool, threads: int) -> list[Fit]:
-        """The fits, in order, each with a random seed of its own."""
+        """The fits, in order, each with its own random seed."""
         seeds = [int(p.rng.integers(2**31)) for p in problems]
         with threadpool_limits(1):  # sums would depend on the number of threads
             return list(map(self._fit_one, problems, seeds))
