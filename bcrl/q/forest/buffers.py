@@ -58,24 +58,38 @@ def move_rows(rows, n, d, depth, start, stop, feature, cut):
     a, b = plane(depth) * n, plane(depth + 1) * n
     left, right = start, stop - U(1)
     shift = np.int64(32) * feature
-    for i in range(start, stop):
-        if d == U(2):
+    if d == U(2) and target.size == 0:
+        for i in range(start, stop):
             word = words[a + i]
             goes_left = U(np.int32(word >> shift) <= cut)
             to = left if goes_left else right
-            words[b + to] = word
-        else:
+            words[b + to], origin[b + to] = word, origin[a + i]
+            left += goes_left
+            right -= U(1) - goes_left
+    elif d == U(2):
+        for i in range(start, stop):
+            word = words[a + i]
+            goes_left = U(np.int32(word >> shift) <= cut)
+            to = left if goes_left else right
+            words[b + to], origin[b + to] = word, origin[a + i]
+            target[b + to] = target[a + i]
+            if weight.size > 0:
+                weight[b + to] = weight[a + i]
+            left += goes_left
+            right -= U(1) - goes_left
+    else:
+        for i in range(start, stop):
             goes_left = U(keys[(a + i) * d + U(feature)] <= cut)
             to = left if goes_left else right
             for f in range(d):
                 keys[(b + to) * d + f] = keys[(a + i) * d + f]
-        origin[b + to] = origin[a + i]
-        if target.size > 0:
-            target[b + to] = target[a + i]
-        if weight.size > 0:
-            weight[b + to] = weight[a + i]
-        left += goes_left
-        right -= U(1) - goes_left
+            origin[b + to] = origin[a + i]
+            if target.size > 0:
+                target[b + to] = target[a + i]
+            if weight.size > 0:
+                weight[b + to] = weight[a + i]
+            left += goes_left
+            right -= U(1) - goes_left
     return left
 
 
