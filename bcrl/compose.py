@@ -19,7 +19,7 @@ from bcrl.config import Choice, Config, construct, one_of
 from bcrl.envs import Env, check_tasks
 from bcrl.errors import ConfigError, at_least, did_you_mean
 from bcrl.identity import Plain, differences
-from bcrl.loggers import logger
+from bcrl.results.loggers import logger
 from bcrl.safety import check_name
 from bcrl.stage import Stage
 from bcrl.tasks import tasks_of

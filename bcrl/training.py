@@ -15,15 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from bcrl import checkpoints, loggers, records
+from bcrl import checkpoints, records
 from bcrl.compose import Plan
 from bcrl.errors import BcrlError
 from bcrl.evaluation import StepProbe
 from bcrl.interrupts import Stop
 from bcrl.locks import Lock, claimed
-from bcrl.loggers import Log
 from bcrl.probes import Probe
 from bcrl.progress import Tick, named
+from bcrl.results import loggers
+from bcrl.results.loggers import Log
 from bcrl.rollout import success_of
 from bcrl.stage import Course, Snapshot, Team
 from bcrl.terminal import say

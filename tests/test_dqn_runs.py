@@ -14,7 +14,7 @@ import torch
 from bcrl import api, runner
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.records import is_complete, pending
-from bcrl.report.seedfiles import read_csv
+from bcrl.results.read import read_csv
 from bcrl.stage import Team, learn
 from tests.conftest import plan
 from tests.test_runs import digest

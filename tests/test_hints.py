@@ -11,7 +11,7 @@ import pytest
 from bcrl import cli, guard, overview, runner, shell, vetting
 from bcrl.errors import BcrlError
 from bcrl.report import cli as report
-from bcrl.report import verify
+from bcrl.results import verify
 from tests.conftest import plan, plans
 
 MAZE, DQN = "env=maze", "env=linear_system algorithm=dqn"

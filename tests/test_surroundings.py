@@ -26,13 +26,14 @@ from bcrl import (
 )
 from bcrl.divergence import diverging
 from bcrl.errors import BcrlError
-from bcrl.report import statistics, style
-from bcrl.report.learning import figure_curves
+from bcrl.report import statistics
+from bcrl.report.figures import style
+from bcrl.report.figures.curves import figure_curves
 from bcrl.report.load import load_runs
-from bcrl.report.seedfiles import command
+from bcrl.results.read import command_of as command
 from bcrl.workers import cores
 from tests.conftest import arguments, plan
-from tests.made_up import made_up_plan, write_seeds
+from tests.results.made_up import made_up_plan, write_seeds
 
 # --- compiled code
 
@@ -312,11 +313,11 @@ def test_seeds_are_in_the_order_of_their_numbers(tmp_path):
 def test_intervals_do_not_depend_on_blocks(monkeypatch):
     values = np.random.default_rng(0).normal(size=(30, 4))
     whole = statistics.bootstrap_curves(values), statistics.bootstrap(values[:, 0])
-    apart = statistics.bootstrap_difference(values[:, 0], values[:20, 1])
+    apart = statistics.bootstrap(values[:, 0], values[:20, 1])
     monkeypatch.setattr(statistics, "BLOCK", 30 * 777)
     blocks = statistics.bootstrap_curves(values), statistics.bootstrap(values[:, 0])
     assert np.allclose(whole[0], blocks[0], rtol=1e-13) and whole[1] == blocks[1]
-    assert statistics.bootstrap_difference(values[:, 0], values[:20, 1]) == apart
+    assert statistics.bootstrap(values[:, 0], values[:20, 1]) == apart
 
 
 # --- commands

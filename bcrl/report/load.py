@@ -5,26 +5,17 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from bcrl.divergence import diverging
 from bcrl.errors import BcrlError
-from bcrl.report.findings import BROKEN, INCOMPLETE, Finding
-from bcrl.report.integrity import Checked, check_tree
 from bcrl.report.notes import Note, across_methods, listed
-from bcrl.report.seedfiles import INDEX, METRICS, family_of
-from bcrl.report.variants import DQN_METHODS, METHODS, Runs, Variant
+from bcrl.report.variants import COMPARED, Runs, Variant
+from bcrl.results.integrity import Checked, check_tree
+from bcrl.results.layout import FQI_METRICS, INDEX, family_of
+from bcrl.results.read import BROKEN, INCOMPLETE, Finding
 
-#: The methods that the figures compare: what is absent of them gets a note.
-COMPARED = {
-    ("car_on_hill", "FQI"): METHODS,
-    ("maze", "FQI"): METHODS,
-    ("linear_system", "DQN"): tuple(
-        name for name in DQN_METHODS if name not in ("B-DQN", "S-DQN", "SB-DQN")
-    ),
-}
 LISTED = 10  # findings that an error names
 
 
@@ -32,10 +23,10 @@ def load_runs(runs_dir: Path, scale: str, allow_incomplete: bool = False) -> Run
     """Everything complete under `runs_dir`/`scale`.
 
     Raises BcrlError if there is nothing, if any file there is broken or, unless
-    `allow_incomplete`, if any seed that was asked for is not complete.
+    `allow_incomplete`, if any requested seed is not complete.
     """
     checked, findings = check_tree(runs_dir, scale)
-    _refuse(runs_dir, scale, findings, allow_incomplete)
+    _reject(runs_dir, scale, findings, allow_incomplete)
     notes: list[Note] = []
     loaded = [_variant(each, notes) for each in checked]
     variants = tuple(variant for variant in loaded if variant is not None)
@@ -44,8 +35,7 @@ def load_runs(runs_dir: Path, scale: str, allow_incomplete: bool = False) -> Run
     runs = Runs(scale, variants, notes)
     for env, family in runs.pairs:
         expected = COMPARED.get((env, family))
-        ours = [v for v in variants if (v.env, v.family) == (env, family)]
-        for tag in sorted({v.tag or "" for v in ours}):
+        for tag in sorted({v.tag or "" for v in runs.of(env, family)}):
             found = runs.tagged(env, family, tag or None)
             methods = {n: v for n, v in found.items() if n in (expected or found)}
             # A tag may be meant for one method only, so absent ones go unmentioned.
@@ -54,23 +44,23 @@ def load_runs(runs_dir: Path, scale: str, allow_incomplete: bool = False) -> Run
     return runs
 
 
-def _refuse(
+def _reject(
     runs_dir: Path, scale: str, findings: list[Finding], allow_incomplete: bool
 ) -> None:
     """Raise BcrlError, which lists them, for findings that are not to be overlooked."""
-    refused = [f for f in findings if f.kind == BROKEN or not allow_incomplete]
-    if not refused:
+    rejected = [f for f in findings if f.kind == BROKEN or not allow_incomplete]
+    if not rejected:
         return
     lines = [f"nothing is drawn, because in {runs_dir / scale}:"]
-    lines += [f"  {finding}" for finding in refused[:LISTED]]
-    if len(refused) > LISTED:
-        more = len(refused) - LISTED
+    lines += [f"  {finding}" for finding in rejected[:LISTED]]
+    if len(rejected) > LISTED:
+        more = len(rejected) - LISTED
         shown = shlex.join(["bcrl-verify", str(runs_dir)])
         lines.append(f"  and {more} more; `{shown}` lists all")
-    if any(finding.kind == INCOMPLETE for finding in refused):
+    if any(finding.kind == INCOMPLETE for finding in rejected):
         lines.append("--allow-incomplete draws what is complete and says so in figures")
     if allow_incomplete:
-        lines.append("broken files are refused with --allow-incomplete, too")
+        lines.append("broken files are rejected with --allow-incomplete, too")
     raise BcrlError("\n".join(lines))
 
 
@@ -81,55 +71,34 @@ def _nothing(runs_dir: Path, scale: str, notes: list[Note]) -> str:
     seen = f" ({notes[0].text})" if notes else ""
     shown = shlex.join(["bcrl", "experiment=fig1", f"scale={scale}"])
     return (
-        f"no complete runs under {runs_dir / scale}{seen}{there}: "
-        f"`{shown}` makes those of figure 1, "
-        "experiment=fig2 those of figures 2, 3 and 5, experiment=fig4 those of "
-        "figure 4"
+        f"no complete runs under {runs_dir / scale}{seen}{there}: `{shown}` makes "
+        "those of figure 1, experiment=fig2 those of figures 2, 3 and 5, "
+        "experiment=fig4 those of figure 4"
     )
 
 
 def _variant(checked: Checked, notes: list[Note]) -> Variant | None:
     """A checked folder's seeds in arrays; None if it can't be drawn, with a note."""
-    folder, tables = checked.folder, checked.tables
-    env, (method, _, tag_text) = folder.parent.name, folder.name.partition("@")
-    tag = tag_text or None
-    if checked.findings:
-        notes.append(_incomplete(checked, env, method, tag))
-    if not tables:
-        return None
-    first = next(iter(tables.values()))
-    family = family_of(first)
-    *_, counter = INDEX[family]
-    needed = METRICS.get(env, ()) if family == "FQI" else ()
-    lacking = [name for name in needed if name not in first]
-    if lacking:
-        text = f"{folder}: does not record {listed(lacking)}: left out"
-        notes.append(Note(text, env, tag, method=method))
-        return None
+    folder, tables = checked.folder, list(checked.tables.values())
+    columns = tables[0] if tables else ()
+    family = family_of(columns)
+    *_, counter = index = INDEX[family]
     metrics = {
-        str(name): np.stack([table[name].to_numpy() for table in tables.values()])
-        for name in first
-        if name not in INDEX[family]
+        str(name): np.stack([table[name].to_numpy() for table in tables])
+        for name in columns
+        if name not in index
     }
     for values in metrics.values():
         values[~np.isfinite(values)] = np.nan  # a gap, not a line to infinity
-    sidecars = tuple(checked.documents.values())
-    notes.extend(_mixed_code(folder, env, method, tag, sidecars))
-    if far := diverging(metrics):
-        which = ", ".join(f"{name} up to {value:.3g}" for name, value in far.items())
-        footer = f"{folder.name} diverges ({which})"
-        notes.append(Note(f"{folder}: diverges, {which}", env, tag, footer, method))
     stage, task, index = (
-        first[column].to_numpy().astype(np.int64)
-        for column in ("stage", "task", counter)
+        np.array(columns[name] if tables else (), np.int64)
+        for name in ("stage", "task", counter)
     )
-    return Variant(
-        env=env,
-        method=method,
-        tag=tag,
-        family=family,
+    sidecars = tuple(checked.documents.values())
+    variant = Variant(
         folder=folder,
-        seeds=tuple(tables),
+        family=family,
+        seeds=tuple(checked.tables),
         stage=stage,
         task=task,
         index=index,
@@ -137,40 +106,56 @@ def _variant(checked: Checked, notes: list[Note]) -> Variant | None:
         sidecars=sidecars,
         failed=checked.failed,
     )
+    if checked.findings:
+        notes.append(_incomplete(checked, variant))
+    if not tables:
+        return None
+    needed = FQI_METRICS.get(variant.env, ()) if family == "FQI" else ()
+    lacking = [name for name in needed if name not in metrics]
+    odd = [f"does not record {listed(lacking)}: left out"] if lacking else []
+    for text in odd or _mixed_code(variant):
+        notes.append(_note(variant, text))
+    if lacking:
+        return None
+    if far := diverging(metrics):
+        which = ", ".join(f"{name} up to {value:.3g}" for name, value in far.items())
+        notes.append(
+            _note(variant, f"diverges, {which}", f"{folder.name} diverges ({which})")
+        )
+    return variant
 
 
-def _incomplete(checked: Checked, env: str, method: str, tag: str | None) -> Note:
-    """How many of the seeds asked for are there, and what is the matter with others."""
-    folder, failed = checked.folder, len(checked.failed)
-    count = f"{len(checked.tables)} of {len(checked.asked)} seeds"
+def _note(variant: Variant, text: str, footer: str = "", **more: object) -> Note:
+    whole = f"{variant.folder}: {text}"
+    return Note(whole, variant.env, variant.tag, footer, variant.method, **more)
+
+
+def _incomplete(checked: Checked, variant: Variant) -> Note:
+    """How many requested seeds are complete, and what is the matter with others."""
+    failed = f" ({len(checked.failed)} failed)" if checked.failed else ""
+    count = f"{len(checked.tables)} of {len(checked.requested)} seeds"
     why = "; ".join(f"{f.path.name} {f.what}" for f in checked.findings)
-    lost = f" ({failed} failed)" if failed else ""
-    compared = (f for (e, f), names in COMPARED.items() if e == env and method in names)
-    return Note(
-        text=f"{folder}: INCOMPLETE, {count} drawn: {why}",
-        env=env,
-        tag=tag,
-        footer=f"{folder.name} {count}{lost}",
-        method=method,
+    compared = (
+        family
+        for (env, family), names in COMPARED.items()
+        if env == variant.env and variant.method in names
+    )
+    return _note(
+        variant,
+        f"INCOMPLETE, {count} drawn: {why}",
+        f"{variant.name} {count}{failed}",
         family=next(compared, None),
         incomplete=True,
     )
 
 
-def _mixed_code(
-    folder: Path,
-    env: str,
-    method: str,
-    tag: str | None,
-    sidecars: tuple[dict[str, Any], ...],
-) -> Iterator[Note]:
-    """A note if a folder's seeds were computed by different code or libraries."""
+def _mixed_code(variant: Variant) -> Iterator[str]:
+    """A sentence if a folder's seeds were computed by different code or libraries."""
     for what, entry, key in (
         ("git revisions", "git", "revision"),
         ("versions of numpy", "versions", "numpy"),
         ("versions of numba", "versions", "numba"),
     ):
-        found = {str(s.get(entry, {}).get(key))[:10] for s in sidecars}
+        found = {str(s.get(entry, {}).get(key))[:10] for s in variant.sidecars}
         if len(found) > 1:
-            text = f"{folder}: seeds of different {what} ({listed(sorted(found))})"
-            yield Note(text, env, tag, method=method)
+            yield f"seeds of different {what} ({listed(sorted(found))})"

@@ -3,32 +3,29 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bcrl.identity import OUTPUT_KEYS
-from bcrl.report.curves import WINDOW, last, late
-from bcrl.report.linear_claims import seeds_cell
-from bcrl.report.notes import ranges
+from bcrl.identity import OUTPUT_KEYS, flat
+from bcrl.report.late import WINDOW, late
 from bcrl.report.statistics import bootstrap
-from bcrl.report.tables import Section, Table, estimate
+from bcrl.report.tables import ABSENT, Section, Table, mean_cell, seeds_cell
 from bcrl.report.variants import Runs, Variant
+from bcrl.results.layout import spelled
 
 IGNORED = (*OUTPUT_KEYS, "scale")  # top-level keys of a config that all may differ in
-ABSENT = "–"  # a variant's config lacks the key
 
 PREAMBLE = f"""\
 Variants of one method that differ in their configuration, compared over the seeds
 named in their rows. *Late*: a seed's mean over the evaluations of its last {WINDOW}
 environment steps; *last*: the last evaluation or iteration. Brackets are 95 %
 percentile bootstrap intervals over seeds; the best mean of a group is **bold**: late
-for the DQN family, last for FQI. The best of many is flattered by chance: judge it on
-other seeds.
+for the DQN family, last for FQI. Chance flatters the best of many: test it on other
+seeds.
 """
 
 
@@ -48,37 +45,28 @@ class Group:
     @property
     def best(self) -> Variant | None:
         """The variant with the largest mean return, None if all are non-finite."""
-        means = [np.mean(deciding(variant)) for variant in self.variants]
-        finite = [value if np.isfinite(value) else -np.inf for value in means]
-        best = int(np.argmax(finite))
+        means = [np.mean(decisive(variant)) for variant in self.variants]
+        best = int(np.argmax([v if np.isfinite(v) else -np.inf for v in means]))
         return self.variants[best] if np.isfinite(means[best]) else None
 
 
-def deciding(variant: Variant) -> NDArray[np.float64]:
-    """What variants are ranked by: late return, for FQI the last, (S,)."""
-    if "return" not in variant.metrics:
-        return np.full(len(variant.seeds), np.nan)
-    return (last if variant.family == "FQI" else late)(variant, "return")
-
-
-def success(variant: Variant) -> NDArray[np.float64]:
-    """Share of episodes that end at the goal: late, for FQI the last, (S,)."""
+def measured(variant: Variant) -> dict[str, NDArray[np.float64] | None]:
+    """Late and last return and success rate, (S,) each; None for what FQI lacks."""
     if variant.family == "DQN":
-        return late(variant, "success_rate")
-    if "solved" in variant.metrics:
-        return last(variant, "solved")
-    return np.full(len(variant.seeds), np.nan)
+        late_return, success = late(variant, "return"), late(variant, "success_rate")
+    else:
+        late_return = None
+        success = variant.last("solved") if "solved" in variant.metrics else None
+    last_return = variant.last("return") if "return" in variant.metrics else None
+    found = {"late return": late_return, "last return": last_return}
+    return found | {"success rate": success}
 
 
-def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Dotted keys and values as JSON text; lists are values."""
-    for key, value in config.items():
-        if not prefix and key in IGNORED:
-            continue
-        if isinstance(value, Mapping) and value:
-            yield from flatten(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", json.dumps(value, ensure_ascii=False)
+def decisive(variant: Variant) -> NDArray[np.float64]:
+    """The return that ranks variants: late, for FQI the last, (S,); nan without one."""
+    name = "late return" if variant.family == "DQN" else "last return"
+    values = measured(variant)[name]
+    return np.full(len(variant.seeds), np.nan) if values is None else values
 
 
 def groups(runs: Runs) -> list[Group]:
@@ -88,69 +76,69 @@ def groups(runs: Runs) -> list[Group]:
         together.setdefault((variant.env, variant.method), []).append(variant)
     found = []
     for (env, method), variants in together.items():
-        if len(variants) < 2:
-            continue
-        configs = {
-            v.name: dict(flatten(v.sidecars[0].get("config") or {})) for v in variants
-        }
-        known = dict.fromkeys(key for config in configs.values() for key in config)
-        keys = tuple(
-            key
-            for key in known
-            if len({config.get(key) for config in configs.values()}) > 1
-        )
-        settings = {
-            name: tuple(config.get(key, ABSENT).strip('"') for key in keys)
-            for name, config in configs.items()
-        }
-        found.append(Group(env, method, tuple(variants), keys, settings))
+        if len(variants) > 1:
+            configs = {v.name: _texts(v) for v in variants}
+            known = dict.fromkeys(key for texts in configs.values() for key in texts)
+            values = {
+                k: [texts.get(k, ABSENT) for texts in configs.values()] for k in known
+            }
+            keys = tuple(key for key in known if len(set(values[key])) > 1)
+            rows = (
+                zip(*(values[key] for key in keys), strict=True)
+                if keys
+                else ((),) * len(variants)
+            )
+            settings = dict(zip(configs, rows, strict=True))
+            found.append(Group(env, method, tuple(variants), keys, settings))
     return found
 
 
-def _cell(values: NDArray[np.float64] | None) -> str:
-    if values is None:
-        return ABSENT
-    return estimate(float(values.mean()), bootstrap(values))
+def _texts(variant: Variant) -> dict[str, str]:
+    """Dotted keys of a variant's config → values as JSON, strings without quotes."""
+    config = variant.sidecars[0].get("config") or {}
+    flattened = flat({k: v for k, v in config.items() if k not in IGNORED})
+    return {
+        key: json.dumps(value, ensure_ascii=False).strip('"')
+        for key, value in flattened.items()
+    }
 
 
-def _returns(variant: Variant) -> tuple[str, str]:
-    """Late and last return with intervals; FQI has no late one."""
-    if "return" not in variant.metrics:
-        return ABSENT, ABSENT
-    late_return = None if variant.family == "FQI" else late(variant, "return")
-    return _cell(late_return), _cell(last(variant, "return"))
-
-
-def _seeds(variant: Variant) -> str:
-    return f"{ranges(variant.seeds)} · {seeds_cell(variant)}"
-
-
-def _best_table(found: list[Group]) -> Table:
-    rows = []
-    for group in found:
-        best = group.best
-        row = [group.env, group.method, str(len(group.variants))]
-        if best is None:
-            rows.append([*row, ABSENT, ABSENT, ABSENT, ABSENT])
-            continue
-        pairs = zip(group.keys, group.settings[best.name], strict=True)
-        chosen = ", ".join(f"{key} = {value}" for key, value in pairs) or ABSENT
-        rows.append([*row, best.name, chosen, _cell(deciding(best)), _seeds(best)])
+def sweep_sections(found: list[Group]) -> Iterator[Section]:
+    """The best of each group, then every group."""
     header = ("environment", "method", "variants", "best", "its settings", "return")
-    return Table([*header, "seeds · number"], rows)
+    rows = [_best_row(group) for group in found]
+    yield Section("Best", [Table([*header, "seeds · number"], rows)])
+    for group in found:
+        used = {spelled(variant.seeds) for variant in group.variants}
+        same = f"Seeds {used.pop()}." if len(used) == 1 else "Seeds differ by row."
+        text = f"{len(group.variants)} variants. {same}\n"
+        yield Section(f"{group.env}: {group.method}", [text, _group_table(group)])
+
+
+def _best_row(group: Group) -> list[str]:
+    best, row = group.best, [group.env, group.method, str(len(group.variants))]
+    if best is None:
+        return [*row, *[ABSENT] * 4]
+    pairs = zip(group.keys, group.settings[best.name], strict=True)
+    chosen = ", ".join(f"{key} = {value}" for key, value in pairs) or ABSENT
+    return [*row, best.name, chosen, mean_cell(decisive(best)), _seeds(best)]
 
 
 def _group_table(group: Group) -> Table:
-    header = ["variant", *group.keys, "seeds · number", "late return", "last return"]
     rows = []
     for variant in group.variants:
         cells = [variant.name, *group.settings[variant.name], _seeds(variant)]
-        returns = list(_returns(variant))
+        values = [mean_cell(values) for values in measured(variant).values()]
         if variant is group.best:
-            decides = 1 if variant.family == "FQI" else 0
-            returns[decides] = f"**{returns[decides]}**"
-        rows.append([*cells, *returns, _cell(success(variant))])
+            place = 0 if variant.family == "DQN" else 1
+            values[place] = f"**{values[place]}**"
+        rows.append([*cells, *values])
+    header = ["variant", *group.keys, "seeds · number", "late return", "last return"]
     return Table([*header, "success rate"], rows)
+
+
+def _seeds(variant: Variant) -> str:
+    return f"{spelled(variant.seeds)} · {seeds_cell(variant)}"
 
 
 def sweep_report(runs: Runs, found: list[Group]) -> str:
@@ -165,18 +153,8 @@ def sweep_report(runs: Runs, found: list[Group]) -> str:
     return "\n".join(parts)
 
 
-def sweep_sections(found: list[Group]) -> Iterator[Section]:
-    """The best of each group, then every group."""
-    yield Section("Best", [_best_table(found)])
-    for group in found:
-        used = {ranges(variant.seeds) for variant in group.variants}
-        same = f"Seeds {used.pop()}." if len(used) == 1 else "Seeds differ by row."
-        text = f"{len(group.variants)} variants. {same}\n"
-        yield Section(f"{group.env}: {group.method}", [text, _group_table(group)])
-
-
 def sweep_table(found: list[Group]) -> pd.DataFrame:
-    """One row a variant: settings as JSON text, seeds, returns with intervals."""
+    """One row per variant: settings as JSON text, seeds, returns with intervals."""
     rows = []
     for group in found:
         for variant in group.variants:
@@ -186,19 +164,14 @@ def sweep_table(found: list[Group]) -> pd.DataFrame:
                 "method": group.method,
                 "variant": variant.name,
                 "settings": json.dumps(dict(settings), ensure_ascii=False),
-                "seeds": ranges(variant.seeds),
+                "seeds": spelled(variant.seeds),
                 "complete": len(variant.seeds),
                 "failed": len(variant.failed),
             }
-            nothing = np.full(len(variant.seeds), np.nan)
-            dqn, has_return = variant.family == "DQN", "return" in variant.metrics
-            measured = {
-                "late_return": late(variant, "return") if dqn else nothing,
-                "last_return": last(variant, "return") if has_return else nothing,
-                "success_rate": success(variant),
-            }
-            for name, values in measured.items():
-                low, high = bootstrap(values)
-                row |= {name: values.mean(), f"{name}_low": low, f"{name}_high": high}
+            for name, values in measured(variant).items():
+                column, known = name.replace(" ", "_"), values is not None
+                mean, (low, high) = np.nan, bootstrap(values if known else [])
+                row |= {column: values.mean() if known else mean}
+                row |= {f"{column}_low": low, f"{column}_high": high}
             rows.append(row | {"best": variant is group.best})
     return pd.DataFrame(rows)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bcrl import files, records
 from bcrl.compose import Plan
-from bcrl.report.seedfiles import METRICS
+from bcrl.results.layout import FQI_METRICS as METRICS
 
 
 def made_up_plan(

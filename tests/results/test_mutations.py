@@ -18,10 +18,11 @@ import yaml
 
 from bcrl.errors import BcrlError
 from bcrl.identity import identity
-from bcrl.report import verify
 from bcrl.report.load import load_runs
-from bcrl.report.seedfiles import DQN_METRICS, METRICS
-from tests.made_up import made_up_plan, write_seeds
+from bcrl.results import verify
+from bcrl.results.layout import DQN_METRICS
+from bcrl.results.layout import FQI_METRICS as METRICS
+from tests.results.made_up import made_up_plan, write_seeds
 
 VARIANTS = {
     "maze/BC-FQI": METRICS["maze"],

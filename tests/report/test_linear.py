@@ -12,14 +12,18 @@ import pandas as pd
 import pytest
 
 from bcrl.errors import BcrlError
-from bcrl.report import cli, curves, style
-from bcrl.report.document import claims_report
-from bcrl.report.linear_figures import figure_4a, figure_4b, prior
-from bcrl.report.load import COMPARED, load_runs
+from bcrl.report import cli
+from bcrl.report import late as curves
+from bcrl.report.claims.document import claims_report
+from bcrl.report.figures import style
+from bcrl.report.figures.linear import figure_4a, figure_4b, prior
+from bcrl.report.load import load_runs
 from bcrl.report.notes import tags_shown
-from bcrl.report.seedfiles import DQN_METRICS, METRICS
 from bcrl.report.sweeps import groups, sweep_report, sweep_table
-from tests.made_up import edit_csv, made_up_plan, rerecord, reseal, write_seeds
+from bcrl.report.variants import COMPARED
+from bcrl.results.layout import DQN_METRICS
+from bcrl.results.layout import FQI_METRICS as METRICS
+from tests.results.made_up import edit_csv, made_up_plan, rerecord, reseal, write_seeds
 
 SEVEN = COMPARED["linear_system", "DQN"]
 LEVEL = {"DQN": -100, "C-DQN": -120, "BC-DQN": -80, "SC-DQN": -60, "SBC-DQN": -45}

@@ -12,14 +12,14 @@ from typing import NoReturn
 from bcrl import __version__
 from bcrl.errors import BcrlError, closest
 
-#: What people type for a flag that is called otherwise.
+#: Words that people type → the flag that they mean.
 HABITS = {"help": "--help", "version": "--version", "v": "--version", "output": "--out"}
 HABITS |= {"out_dir": "--out", "results": "--runs-dir", "dir": "--runs-dir"}
 SCALES = ("smoke", "quick", "paper", "search")
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose refusals are a BcrlError with the words to type."""
+    """A parser that raises a BcrlError, with the words to type, for bad arguments."""
 
     def __init__(self, prog: str, description: str) -> None:
         super().__init__(prog=prog, description=description)
@@ -32,40 +32,41 @@ class Parser(argparse.ArgumentParser):
             help="the results, also runs_dir=PATH as bcrl has it; default: %(default)s",
         )
 
-    def asked(self, words: Sequence[str] | None = None) -> Namespace:
-        """What the words ask for; BcrlError for one that asks for nothing."""
-        given = sys.argv[1:] if words is None else list(words)
-        flags = [flag for each in self._actions for flag in each.option_strings]
-        spelt = [self._spelt(word, flags) for word in given]
-        asked, left = self.parse_known_args(spelt)
+    def parsed(self, words: Sequence[str] | None = None) -> Namespace:
+        """The options in `words` or on the command line; BcrlError for a bad one."""
+        given = [self._spelt(w) for w in (sys.argv[1:] if words is None else words)]
+        options, left = self.parse_known_args(given)
         if left:
-            place = spelt.index(left[0]) if left[0] in spelt else len(given) - 1
+            place = given.index(left[0]) if left[0] in given else len(given) - 1
             word, after = given[place], "".join(given[place + 1 : place + 2])
-            raise BcrlError(f"{word}: unknown; {self._meant(word, after, flags)}")
-        return asked
+            raise BcrlError(f"{word}: unknown; {self._meant(word, after)}")
+        return options
 
     def error(self, message: str) -> NoReturn:
         """Raise BcrlError."""
         raise BcrlError(f"{message}; see {self.prog} --help")
 
-    def _spelt(self, word: str, flags: Sequence[str]) -> str:
+    def _flags(self) -> list[str]:
+        return [flag for each in self._actions for flag in each.option_strings]
+
+    def _spelt(self, word: str) -> str:
         """`runs_dir=PATH` and `--runs_dir=PATH` as `--runs-dir=PATH`."""
         key, equals, value = word.partition("=")
         flag = f"--{key.removeprefix('--').replace('_', '-')}"
-        known = flag in flags and (equals or key.startswith("--"))
+        known = flag in self._flags() and (equals or key.startswith("--"))
         return flag + equals + value if known else word
 
-    def _meant(self, word: str, after: str, flags: Sequence[str]) -> str:
+    def _meant(self, word: str, after: str) -> str:
         """What an unknown word may mean."""
         key, _, value = word.lstrip("+-").partition("=")
         value, name = value or after, key.lower().replace("-", "_").rstrip(":")
+        flags = self._flags()
         scale = closest(word, SCALES, 0.8) if "--scale" in flags else None
         if scale:
             return f"did you mean --scale {scale}?"
         if Path(word).is_dir() and not word.startswith("-"):
             return f"did you mean runs_dir={word}?"
-        near = closest(f"--{name.replace('_', '-')}", flags, 0.6)
-        flag = HABITS.get(name, near)
+        flag = HABITS.get(name) or closest(f"--{name.replace('_', '-')}", flags, 0.6)
         if flag not in flags:
             return f"see {self.prog} --help"
         if flag == "--runs-dir":

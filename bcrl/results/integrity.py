@@ -1,4 +1,4 @@
-"""Whether a variant's folder is what a finished run leaves, and what of it is sound."""
+"""Whether the variants' folders are what finished runs leave, and what is sound."""
 
 from __future__ import annotations
 
@@ -14,23 +14,34 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from bcrl.files import seed_path
 from bcrl.identity import differences, identity
-from bcrl.report.findings import AGAIN, INCOMPLETE, Finding, Refused
-from bcrl.report.notes import listed, ranges
-from bcrl.report.seedfiles import (
+from bcrl.results.layout import (
+    COMPLETE,
+    CONFIG,
+    FAILED,
     INDEX,
-    asked,
-    command,
+    RUNNING,
+    SUFFIXES,
     family_of,
+    requested,
+    seed_path,
+    spelled,
+    state_of,
+)
+from bcrl.results.read import (
+    AGAIN,
+    INCOMPLETE,
+    BadFile,
+    Document,
+    Finding,
+    command_of,
     read_csv,
     read_document,
-    recorded,
-    status,
+    read_recorded,
 )
 
 SHOWN_KEYS = 3  # differing keys of a config that are named
-Documents = dict[int, dict[str, Any]]  # by seed
+Documents = dict[int, Document]  # by seed
 
 
 @dataclass
@@ -38,7 +49,7 @@ class Checked:
     """A variant's folder: the findings in it, and its complete seeds that are sound.
 
     `tables` and `documents` are the CSVs and JSONs of these; `failed` are the seeds
-    that diverged, `asked` all that were asked for.
+    that diverged, `requested` all that the commands so far were to make.
     """
 
     folder: Path
@@ -46,7 +57,7 @@ class Checked:
     documents: Documents = field(default_factory=dict)
     tables: dict[int, pd.DataFrame] = field(default_factory=dict)
     failed: tuple[int, ...] = ()
-    asked: frozenset[int] = frozenset()
+    requested: frozenset[int] = frozenset()
 
 
 def check_tree(
@@ -63,7 +74,6 @@ def check_tree(
 
 
 def _subfolders(folder: Path, findings: list[Finding]) -> list[Path]:
-    """The folders in a folder, unless hidden."""
     return [path for path in _entries(folder, findings) if path.is_dir()]
 
 
@@ -86,24 +96,29 @@ def check_folder(folder: Path) -> Checked:
     result = Checked(folder)
     findings = result.findings
     numbers = _numbers(folder, findings)
-    documents = _documents(folder, numbers, findings)
+    documents: Documents = {}
+    for seed in sorted(numbers):
+        try:
+            documents[seed] = read_document(folder, seed)
+        except BadFile as error:
+            findings.append(error.finding)
     findings += _config_findings(folder, documents)
     for seed, document in documents.items():
         csv, npz = (seed_path(folder, seed, suffix) for suffix in ("csv", "npz"))
-        state = status(document)
+        state = state_of(document)
         try:
-            if state != "running" and "sha256" in document:
-                recorded(npz, document)
-                recorded(csv, document)
-            if state == "complete":
+            if state != RUNNING and "sha256" in document:
+                read_recorded(npz, document)
+                read_recorded(csv, document)
+            if state == COMPLETE:
                 table = read_csv(csv, document)
                 result.tables[seed], result.documents[seed] = table, document
-        except Refused as error:
+        except BadFile as error:
             findings.append(error.finding)
     findings += _index_findings(folder, result.tables)
-    findings += _incomplete_findings(folder, numbers, documents)
-    result.failed = tuple(s for s, d in documents.items() if status(d) == "failed")
-    result.asked = frozenset().union(*map(asked, documents.values()))
+    result.failed = tuple(s for s, d in documents.items() if state_of(d) == FAILED)
+    result.requested = frozenset().union(*map(requested, documents.values()))
+    findings += _incomplete_findings(folder, numbers, documents, result.requested)
     return result
 
 
@@ -111,7 +126,7 @@ def _numbers(folder: Path, findings: list[Finding]) -> set[int]:
     """The seeds that any file is named after; misnamed files are findings."""
     numbers = set()
     for path in _entries(folder, findings):
-        match = re.fullmatch(r"seed_([0-9]+)\.(csv|npz|json)", path.name)
+        match = re.fullmatch(rf"seed_([0-9]+)\.({'|'.join(SUFFIXES)})", path.name)
         if match and path == seed_path(folder, int(match[1]), match[2]):
             numbers.add(int(match[1]))
         elif path.name.startswith("seed_"):
@@ -120,26 +135,9 @@ def _numbers(folder: Path, findings: list[Finding]) -> set[int]:
     return numbers
 
 
-def _documents(
-    folder: Path, numbers: Iterable[int], findings: list[Finding]
-) -> Documents:
-    """The seeds' JSONs that can be trusted; the others are findings."""
-    *_, scale, env, name = folder.parts
-    variant, _, tag = name.partition("@")
-    belongs = {"scale": scale, "env": env, "variant": variant, "tag": tag or None}
-    documents = {}
-    for seed in sorted(numbers):
-        path = seed_path(folder, seed, "json")
-        try:
-            documents[seed] = read_document(path, {"seed": seed} | belongs)
-        except Refused as error:
-            findings.append(error.finding)
-    return documents
-
-
 def _config_findings(folder: Path, documents: Documents) -> list[Finding]:
     """Where config.yaml and the seeds' configs differ in what decides numbers."""
-    path = folder / "config.yaml"
+    path = folder / CONFIG
     anew = f"put it back, or delete {folder} and {AGAIN}"
     try:
         config = yaml.safe_load(path.read_bytes())
@@ -150,18 +148,14 @@ def _config_findings(folder: Path, documents: Documents) -> list[Finding]:
         what = f"is not a readable config ({type(error).__name__})"
         return [Finding(path, what, anew)]
     made = {seed: document["config"] for seed, document in documents.items()}
-    texts = {seed: _text(each) for seed, each in made.items()}
-    odd = [seed for seed in made if texts[seed] != text]
-    if odd and len(odd) == len(made) and len(set(texts.values())) == 1:
-        what = f"is not its seeds' config ({_changed(config, made[odd[0]])})"
+    odd = {seed: _text(each) for seed, each in made.items() if _text(each) != text}
+    if odd and len(odd) == len(made) and len(set(odd.values())) == 1:
+        what = f"is not its seeds' config ({_changed(config, made[min(odd)])})"
         return [Finding(path, what, anew)]
     return [
-        Finding(
-            seed_path(folder, seed, "json"),
-            f"has another config than config.yaml ({_changed(config, made[seed])})",
-            f"delete {seed_path(folder, seed, '*')} and {AGAIN}",
-        )
+        _mixed(folder, seed, "json", f"has another config than {CONFIG} ({changed})")
         for seed in odd
+        for changed in [_changed(config, made[seed])]
     ]
 
 
@@ -178,62 +172,59 @@ def _changed(config: dict[str, Any], made: dict[str, Any]) -> str:
     return "; ".join(shown + [f"and {more} more"] * (more > 0)) or "types of values"
 
 
-def _index_findings(folder: Path, tables: Mapping[int, pd.DataFrame]) -> list[Finding]:
+def _mixed(folder: Path, seed: int, suffix: str, what: str) -> Finding:
+    """A seed that is not of the same origin as the others in its folder."""
+    remedy = f"delete {seed_path(folder, seed, '*')} and {AGAIN}"
+    return Finding(seed_path(folder, seed, suffix), what, remedy)
+
+
+def _index_findings(
+    folder: Path, tables: Mapping[int, pd.DataFrame]
+) -> Iterator[Finding]:
     """Seeds whose stages, tasks or counters are not those of most."""
-    indices = {
-        seed: table[list(INDEX[family_of(table)])] for seed, table in tables.items()
-    }
+    indices = {seed: t[list(INDEX[family_of(t)])] for seed, t in tables.items()}
     keys = {s: (*i.columns, i.to_numpy().tobytes()) for s, i in indices.items()}
-    (usual, _), *others = Counter(keys.values()).most_common() or [(None, 0)]
-    if not others:
-        return []
-    model = next(seed for seed in keys if keys[seed] == usual)
-    return [
-        Finding(
-            seed_path(folder, seed, "csv"),
-            f"differs from {seed_path(folder, model, 'csv').name} in its "
-            f"{_columns(indices[seed], indices[model])}, so the folder mixes two "
-            "configurations or versions",
-            f"delete {seed_path(folder, seed, '*')} and {AGAIN}",
-        )
-        for seed in keys
-        if keys[seed] != usual
-    ]
+    for usual, _ in Counter(keys.values()).most_common(1):
+        model = next(seed for seed in keys if keys[seed] == usual)
+        for seed in keys:
+            if keys[seed] != usual:
+                where = _differing(indices[seed], indices[model])
+                yield _mixed(
+                    *(folder, seed, "csv"),
+                    f"differs from {seed_path(folder, model, 'csv').name} in its "
+                    f"{where}, so the folder mixes two configurations or versions",
+                )
 
 
-def _columns(index: pd.DataFrame, model: pd.DataFrame) -> str:
+def _differing(index: pd.DataFrame, model: pd.DataFrame) -> str:
     if len(index) != len(model):
         return f"length ({len(index)} rows, not {len(model)})"
     differ = [name for name in model if not model[name].equals(index.get(name))]
-    return f"{listed(differ)} column{'s' * (len(differ) > 1)}"
+    return f"{' and '.join(differ)} column{'s' * (len(differ) > 1)}"
 
 
 def _incomplete_findings(
-    folder: Path, numbers: set[int], documents: Documents
+    folder: Path, numbers: set[int], documents: Documents, wanted: Iterable[int]
 ) -> Iterator[Finding]:
-    """Seeds that are not complete: begun, failed, or not there though asked for."""
+    """Seeds that are not complete: begun, failed, or requested and absent."""
     for seed, document in documents.items():
-        path = seed_path(folder, seed, "json")
-        if status(document) == "running":
+        path, state = seed_path(folder, seed, "json"), state_of(document)
+        if state == RUNNING:
             what = 'says "running": it is being computed, or its process was killed'
             yield Finding(path, what, AGAIN, INCOMPLETE)
-        if status(document) == "failed":
+        if state == FAILED:
             what = f'says "{document["status"]}"'
             remedy = f"{AGAIN} to try it again, or leave it out"
             yield Finding(path, what, remedy, INCOMPLETE)
-    missing = sorted(set().union(*map(asked, documents.values())) - numbers)
+    missing = sorted(set(wanted) - numbers)
     if missing:
+        made = (d for d in documents.values() if missing[0] in requested(d))
+        typed = next(filter(None, map(command_of, made)), "")
         noun = "seed" if len(missing) == 1 else "seeds"
-        what = f"lacks {noun} {ranges(missing)}, which had been asked for"
-        remedy = _command(documents.values(), missing[0])
-        yield Finding(folder, what, remedy, INCOMPLETE)
+        what = f"lacks {noun} {spelled(missing)}, which a command was to make"
+        yield Finding(
+            folder, what, AGAIN + (f" (`{typed}`)" if typed else ""), INCOMPLETE
+        )
     if not numbers:
         remedy = f"{AGAIN}, or move the folder away"
         yield Finding(folder, "has no seeds", remedy, INCOMPLETE)
-
-
-def _command(documents: Iterable[dict[str, Any]], seed: int) -> str:
-    """What to do about a missing seed: the command that asked for it, if known."""
-    commands = (command(d) for d in documents if seed in asked(d))
-    found = next(filter(None, commands), None)
-    return f"{AGAIN} (`{found}`)" if found else AGAIN

@@ -17,11 +17,17 @@ from PIL import Image
 from bcrl.report import cli
 from bcrl.report import statistics as st
 from bcrl.report.curve_data import curve_data
-from bcrl.report.learning import POINTS, curve, figure_curves, shared_spans
+from bcrl.report.figures.curves import (
+    POINTS,
+    Curve,
+    figure_curves,
+    shared_spans,
+    spread_rows,
+)
 from bcrl.report.load import load_runs
-from bcrl.report.seedfiles import DQN_METRICS
-from tests.made_up import made_up_plan, write_seeds
-from tests.test_report import write_runs
+from bcrl.results.layout import DQN_METRICS
+from tests.report.test_report import write_runs
+from tests.results.made_up import made_up_plan, write_seeds
 
 OWN = "my_<i>env"  # folders can be called so
 
@@ -143,11 +149,11 @@ def test_long_curves_keep_their_stages_ends(tmp_path):
     plan = made_up_plan(tmp_path, "cart", "C-DQN", range(2))
     write_seeds(plan, lambda s: dqn_table(s, [700_000, 1_300_000], [1, 2]))
     (variant,) = load_runs(tmp_path, "smoke").variants
-    found = curve(variant, "return")
+    found = Curve(variant, "return", spread_rows(variant))
     assert POINTS <= len(found.x) <= POINTS + 2
     assert found.x[0] == 0 and found.x[-1] == 2_000_000
     assert (found.x == 700_000).sum() == 2
-    np.testing.assert_array_equal(found.mean, found.values.mean(axis=0))
+    np.testing.assert_array_equal(found.values[0, 0], variant.metrics["return"][0, 0])
 
 
 def test_the_pages_curves_are_the_aggregates(reported):

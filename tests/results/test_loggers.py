@@ -10,10 +10,11 @@ import pandas as pd
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from bcrl import loggers, runner
+from bcrl import runner
 from bcrl.errors import ConfigError
 from bcrl.interrupts import Interrupted
-from bcrl.report.integrity import check_tree
+from bcrl.results import loggers
+from bcrl.results.integrity import check_tree
 from tests.conftest import plan
 
 BC = ("env=maze", "variant=BC", "scale=smoke", "seeds.count=2", "progress=none")

@@ -10,10 +10,10 @@ import pandas as pd
 import pytest
 
 from bcrl.errors import BcrlError
-from bcrl.report import verify
-from bcrl.report.integrity import check_tree
 from bcrl.report.load import load_runs
-from tests.made_up import (
+from bcrl.results import verify
+from bcrl.results.integrity import check_tree
+from tests.results.made_up import (
     edit_config,
     edit_csv,
     made_up_plan,

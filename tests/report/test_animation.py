@@ -14,7 +14,7 @@ from bcrl.report.animation import frames, typical_seed
 from bcrl.report.cli import main
 from bcrl.report.load import load_runs
 from tests.conftest import plan
-from tests.made_up import made_up_plan, write_seeds
+from tests.results.made_up import made_up_plan, write_seeds
 
 SMALL = ("scale=smoke", "seeds.count=2", "progress=none")
 CAR = CarOnHill(mass=1.2)

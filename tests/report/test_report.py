@@ -13,15 +13,18 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from bcrl import files
-from bcrl.report import cli, figures, style, verdicts
+from bcrl.report import cli
 from bcrl.report import statistics as st
-from bcrl.report.document import claims_report
+from bcrl.report.claims import judge
+from bcrl.report.claims.document import claims_report
+from bcrl.report.figures import curves as figures
+from bcrl.report.figures import style
+from bcrl.report.figures.maze import figure_3, seed_mean_value
 from bcrl.report.load import load_runs
-from bcrl.report.maze_figure import figure_3, seed_mean_value
-from bcrl.report.seedfiles import METRICS
 from bcrl.report.tables import aggregate
 from bcrl.report.variants import METHODS, Runs
-from tests.made_up import made_up_plan, rerecord, reseal, write_seeds
+from bcrl.results.layout import FQI_METRICS as METRICS
+from tests.results.made_up import made_up_plan, rerecord, reseal, write_seeds
 
 LENGTHS = {
     "car_on_hill": (20, 20, 20),
@@ -171,12 +174,12 @@ def test_bootstrap_agrees_with_scipys():
     assert ours == pytest.approx(tuple(theirs), abs=0.02)
 
 
-def test_bootstrap_difference():
+def test_bootstrap():
     same = np.full(5, 3.0)
-    assert st.bootstrap_difference(same + 2, same) == (2.0, 2.0)
+    assert st.bootstrap(same + 2, same) == (2.0, 2.0)
     # independent resampling: variances add, so the interval is √2 times as wide
     values = np.random.default_rng(2).normal(size=50)
-    low, high = st.bootstrap_difference(values, values)
+    low, high = st.bootstrap(values, values)
     one = st.bootstrap(values)
     assert low < 0 < high
     assert (high - low) / (one.high - one.low) == pytest.approx(np.sqrt(2), rel=0.05)
@@ -392,8 +395,8 @@ def test_few_seeds_decide_nothing(tmp_path):
     ],
 )
 def test_verdicts(low, high, expect, verdict):
-    measured = verdicts.Measured((low + high) / 2, st.Interval(low, high))
-    assert verdicts.judge(measured, expect, seeds=9) == verdict
+    measured = judge.Measured((low + high) / 2, st.Interval(low, high))
+    assert judge.verdict(measured, expect, seeds=9) == verdict
 
 
 def test_claims_without_the_method_say_so(tmp_path):

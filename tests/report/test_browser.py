@@ -15,10 +15,11 @@ import pandas as pd
 import pytest
 from PIL import Image, ImageColor
 
-from bcrl.report import cli, style
-from bcrl.report.seedfiles import METRICS
-from tests.test_page import write_own
-from tests.test_report import write_runs
+from bcrl.report import cli
+from bcrl.report.figures import style
+from bcrl.results.layout import FQI_METRICS as METRICS
+from tests.report.test_page import write_own
+from tests.report.test_report import write_runs
 
 NEEDED = "BCRL_BROWSER"  # set where a missing browser is an error, as in CI
 SWITCHES = (

@@ -1,0 +1,1 @@
+"""Results on disk: their layout, reading and checking them, and live logging."""
