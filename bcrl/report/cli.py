@@ -10,8 +10,9 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.figure import Figure
 
+from bcrl.common.files import make_directory, write_text
+from bcrl.common.terminal import ready, say, show
 from bcrl.errors import BcrlError
-from bcrl.files import make_directory, write_text
 from bcrl.report.animation import animations, gif_of
 from bcrl.report.claims.document import claims_report
 from bcrl.report.figures import style
@@ -25,7 +26,6 @@ from bcrl.report.sweeps import groups, sweep_report, sweep_table
 from bcrl.report.tables import aggregate
 from bcrl.report.variants import COMPARED, Runs, env_title
 from bcrl.results.arguments import Parser
-from bcrl.terminal import ready, say, show
 
 CAR, MAZE, LQ = ("car_on_hill", "FQI"), ("maze", "FQI"), (LINEAR, "DQN")
 #: figure → its runs' environment and family, experiment, method it cannot do without

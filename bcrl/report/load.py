@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bcrl.divergence import diverging
+from bcrl.common.divergence import diverging
 from bcrl.errors import BcrlError
 from bcrl.report.notes import Note, across_methods, listed
 from bcrl.report.variants import COMPARED, Runs, Variant

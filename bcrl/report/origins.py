@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from bcrl.identity import differences, flat, identity
+from bcrl.common.identity import differences, flat, identity
 from bcrl.report.tables import ABSENT, Table, duration, number
 from bcrl.report.variants import Runs, Variant, env_title
 from bcrl.results.layout import seed_path, spelled

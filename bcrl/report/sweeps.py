@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bcrl.identity import OUTPUT_KEYS, flat
+from bcrl.common.identity import OUTPUT_KEYS, flat
 from bcrl.report.late import WINDOW, late
 from bcrl.report.statistics import bootstrap
 from bcrl.report.tables import ABSENT, Section, Table, mean_cell, seeds_cell

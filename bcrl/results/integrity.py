@@ -14,13 +14,14 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from bcrl.identity import differences, identity
+from bcrl.common.identity import differences, identity
 from bcrl.results.layout import (
     COMPLETE,
     CONFIG,
     FAILED,
     INDEX,
     RUNNING,
+    SEED,
     SUFFIXES,
     family_of,
     requested,
@@ -126,10 +127,10 @@ def _numbers(folder: Path, findings: list[Finding]) -> set[int]:
     """The seeds that any file is named after; misnamed files are findings."""
     numbers = set()
     for path in _entries(folder, findings):
-        match = re.fullmatch(rf"seed_([0-9]+)\.({'|'.join(SUFFIXES)})", path.name)
+        match = re.fullmatch(rf"{SEED}([0-9]+)\.({'|'.join(SUFFIXES)})", path.name)
         if match and path == seed_path(folder, int(match[1]), match[2]):
             numbers.add(int(match[1]))
-        elif path.name.startswith("seed_"):
+        elif path.name.startswith(SEED):
             what = "is not a name that bcrl gives"
             findings.append(Finding(path, what, "move it out of the folder"))
     return numbers
@@ -199,7 +200,7 @@ def _index_findings(
 def _differing(index: pd.DataFrame, model: pd.DataFrame) -> str:
     if len(index) != len(model):
         return f"length ({len(index)} rows, not {len(model)})"
-    differ = [name for name in model if not model[name].equals(index.get(name))]
+    differ = [str(c) for c in model if list(model[c]) != list(index.get(c, []))]
     return f"{' and '.join(differ)} column{'s' * (len(differ) > 1)}"
 
 

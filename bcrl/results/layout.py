@@ -16,6 +16,7 @@ from typing import Any
 SCHEMA = 2  # of a seed's files; raised when their meaning changes
 CONFIG = "config.yaml"
 SUFFIXES = ("json", "csv", "npz")
+SEED, CHECKPOINT = "seed_", "checkpoint_"  # what names of files begin with
 LOGS = ".tensorboard"  # in runs_dir; hidden, because it holds no results
 
 #: What a seed's JSON begins its `status` with; `failed` is followed by the reason.
@@ -48,12 +49,12 @@ def seed_path(folder: Path, seed: int, suffix: str) -> Path:
 
 def seed_name(seed: int) -> str:
     """`seed_0007`: a seed's files without their suffix, and its folder of logs."""
-    return f"seed_{seed:04d}"
+    return f"{SEED}{seed:04d}"
 
 
 def seeds_of(folder: Path, suffix: str) -> list[int]:
     """The seeds that a folder has files of, in order; other files are passed over."""
-    stems = (path.stem.removeprefix("seed_") for path in folder.glob("seed_*"))
+    stems = (path.stem.removeprefix(SEED) for path in folder.glob(f"{SEED}*"))
     seeds = sorted({int(stem) for stem in stems if stem.isdecimal()})
     return [seed for seed in seeds if seed_path(folder, seed, suffix).exists()]
 

@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from bcrl.common.files import is_intact, sha256
 from bcrl.errors import BcrlError
-from bcrl.files import is_intact, sha256
 from bcrl.results.layout import (
     COMPLETE,
     DQN_METRICS,
@@ -151,7 +151,8 @@ def read_csv(path: Path, document: Document) -> pd.DataFrame:
     except ValueError as error:
         raise bad_file(path, f"holds something not a number ({error})") from error
     family = family_of(table)
-    metrics = known = DQN_METRICS
+    metrics: tuple[str, ...] = DQN_METRICS
+    known = metrics
     if family == "FQI":
         metrics = tuple(dict.fromkeys(document["config"]["env"]["metrics"]))
         known = FQI_METRICS.get(document["env"], ())

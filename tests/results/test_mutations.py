@@ -16,8 +16,8 @@ import pandas as pd
 import pytest
 import yaml
 
+from bcrl.common.identity import identity
 from bcrl.errors import BcrlError
-from bcrl.identity import identity
 from bcrl.report.load import load_runs
 from bcrl.results import verify
 from bcrl.results.layout import DQN_METRICS

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bcrl.divergence import diverging
+from bcrl.common.divergence import diverging
 from bcrl.report.figures import style
 from bcrl.report.statistics import bootstrap_curves, mean, standard_error
 from bcrl.report.variants import Methods, Runs, Variant

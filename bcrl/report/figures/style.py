@@ -18,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from bcrl import __version__
-from bcrl.files import write_atomically
+from bcrl.common.files import write_atomically
 from bcrl.report.notes import remarks, tags_shown
 from bcrl.report.variants import Methods, Runs, Variant, env_title
 

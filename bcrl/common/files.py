@@ -1,0 +1,107 @@
+"""Files that are whole or absent, and documents that know if they were changed."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from bcrl.errors import BcrlError
+
+DIGEST = "digest"  # a sealed document's key for the hash of all its others
+
+
+def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> Path:
+    """Let `write` fill a hidden neighbour of `path`, then rename it to `path`.
+
+    A reader sees the old file or the new one, never half of one, and once this returns
+    the new one survives a power cut. Raises BcrlError if the folder is gone or cannot
+    be written to.
+    """
+    hidden = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(hidden, "wb") as handle:
+            write(handle)
+            handle.flush()
+            os.fsync(handle.fileno())
+        os.replace(hidden, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        gone = "" if path.parent.is_dir() else f"; the folder {path.parent} is gone"
+        why = error.strerror or error
+        raise BcrlError(f"cannot write {path}: {why}{gone}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            hidden.unlink()
+    return path
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename in `folder` durable, where the file system knows how."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write UTF-8 text with Unix line ends, atomically."""
+    return write_atomically(path, lambda handle: handle.write(text.encode()))
+
+
+def user_folder(variable: str, usual: str) -> Path | None:
+    """A folder of the user's: XDG's `variable` if absolute, else `usual` at home.
+
+    None where no home is known: `~` never names a folder.
+    """
+    try:
+        chosen = Path(os.environ.get(variable, "")).expanduser()
+        folder = chosen if chosen.is_absolute() else Path.home() / usual
+    except RuntimeError:
+        return None
+    return folder if folder.is_absolute() else None
+
+
+def make_directory(directory: Path, key: str) -> None:
+    """Make a folder and those above it; BcrlError names `key` if that can't be done."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BcrlError(f"{key}: can't make {directory}: {error.strerror}") from error
+
+
+def remove_half_written(folder: Path, start: str) -> None:
+    """Remove what processes killed while writing files `start`… have left.
+
+    For those only who hold the lock under which such files are written.
+    """
+    for left in folder.glob(f".{start}*.tmp"):
+        left.unlink(missing_ok=True)
+
+
+def sha256(data: bytes) -> str:
+    """The SHA-256 of a file's bytes, hexadecimal."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def sealed(document: dict[str, Any]) -> str:
+    """A JSON object as text, with a `digest` over its values."""
+    whole = document | {DIGEST: _digest(document)}
+    return json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False)
+
+
+def is_intact(document: dict[str, Any]) -> bool:
+    """Whether a document that `sealed` wrote still has the values that it had."""
+    rest = {key: value for key, value in document.items() if key != DIGEST}
+    return document.get(DIGEST) == _digest(rest)
+
+
+def _digest(document: dict[str, Any]) -> str:
+    text = json.dumps(document, sort_keys=True, separators=(",", ":"))
+    return sha256(text.encode())
