@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import pandas as pd
 from matplotlib.figure import Figure
 
 from bcrl.common.files import make_directory, write_text
@@ -22,7 +21,7 @@ from bcrl.report.figures.maze import figure_3
 from bcrl.report.late import LINEAR
 from bcrl.report.load import load_runs
 from bcrl.report.page import Picture, Pictures, page
-from bcrl.report.sweeps import groups, sweep_report, sweep_table
+from bcrl.report.sweeps import groups, sweep_report
 from bcrl.report.tables import aggregate
 from bcrl.report.variants import COMPARED, Runs, env_title
 from bcrl.results.arguments import Parser
@@ -107,13 +106,12 @@ def report(
     fallback = _draw_curves(runs, out, tag, files) if CURVES in figures else {}
     for family, stem in (("FQI", "aggregate"), ("DQN", "aggregate_dqn")):
         if family in {variant.family for variant in runs.variants}:
-            path = out / f"{stem}_{runs.scale}.csv"
-            files.append(_write_csv(path, aggregate(runs, family)))
+            text = aggregate(runs, family).to_csv(index=False, lineterminator="\n")
+            files.append(write_text(out / f"{stem}_{runs.scale}.csv", text))
     files.append(write_text(out / f"claims_{suffix}.md", claims_report(runs, tag)))
     if compared := groups(runs):
-        path = out / f"sweep_{runs.scale}.md"
-        files.append(write_text(path, sweep_report(runs, compared)))
-        files.append(_write_csv(path.with_suffix(".csv"), sweep_table(compared)))
+        text = sweep_report(runs, compared)
+        files.append(write_text(out / f"sweep_{runs.scale}.md", text))
     agents = [
         Picture(path, f"{env_title(variant.env)}: {variant.name}")
         for variant in runs.variants
@@ -148,10 +146,6 @@ def _draw_curves(runs: Runs, out: Path, tag: str | None, files: list[Path]) -> P
             pictures.setdefault((env, family), []).append(picture)
             files += saved
     return pictures
-
-
-def _write_csv(path: Path, table: pd.DataFrame) -> Path:
-    return write_text(path, table.to_csv(index=False, lineterminator="\n"))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

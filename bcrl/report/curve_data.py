@@ -10,17 +10,17 @@ import numpy as np
 from matplotlib.colors import to_hex, to_rgb
 from numpy.typing import NDArray
 
+from bcrl.common.divergence import diverging
 from bcrl.report.figures import style
 from bcrl.report.figures.curves import (
     COUNTED,
-    Curve,
     label,
     metrics_of,
     optimum_of,
     shared_spans,
     spread_rows,
 )
-from bcrl.report.statistics import mean
+from bcrl.report.statistics import bootstrap_curves, mean
 from bcrl.report.variants import Runs, Variant
 from bcrl.results.layout import INDEX
 
@@ -69,37 +69,29 @@ def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, 
 
 
 def _series(variant: Variant, metrics: list[str]) -> dict[str, Any]:
-    """A variant's curves, which all have the same points."""
+    """A variant's curves, which all have the same points; those `far` off are cut."""
     rows, light = spread_rows(variant), style.colour(variant.method)
-    curves = {metric: Curve(variant, metric, rows) for metric in metrics}
+    far, curves = diverging(variant.metrics), {}
+    for metric in metrics:
+        values = variant.metrics[metric][:, rows]
+        low, high = bootstrap_curves(values)
+        q1, median, q3 = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
+        lines = {"low": low, "high": high, "median": median, "q1": q1, "q3": q3}
+        curves[metric] = {name: _numbers(line) for name, line in lines.items()}
+        curves[metric]["mean"] = _numbers(mean(values), 7)
+        curves[metric]["seeds"] = [_numbers(seed) for seed in values[:SEEDS]]
+        curves[metric]["far"] = metric in far
     return {
         "name": variant.name,
         "light": light,
         "dark": _on_black(light),
         "x": variant.index[rows].tolist(),
         "task": variant.task[rows].tolist(),
-        "metrics": {metric: _points(curve) for metric, curve in curves.items()},
+        "metrics": curves,
     }
 
 
-def _points(curve: Curve) -> dict[str, Any]:
-    """A curve's lines, and whether it is `far`, so that the axis leaves it out."""
-    values = curve.values
-    lines = {"mean": mean(values)}
-    lines |= dict(zip(("low", "high"), curve.interval(values), strict=True))
-    lines |= dict(
-        zip(
-            ("q1", "median", "q3"),
-            np.quantile(values, [0.25, 0.5, 0.75], axis=0),
-            strict=True,
-        )
-    )
-    points = {k: _numbers(line, 7 if k == "mean" else 4) for k, line in lines.items()}
-    seeds = [_numbers(seed, 4) for seed in values[:SEEDS]]
-    return points | {"far": curve.diverges, "seeds": seeds}
-
-
-def _numbers(values: NDArray[np.float64], digits: int) -> list[float | None]:
+def _numbers(values: NDArray[np.float64], digits: int = 4) -> list[float | None]:
     """Rounded to significant digits; None for what is not finite."""
     return [float(f"{v:.{digits}g}") if np.isfinite(v) else None for v in values]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -80,82 +80,54 @@ def _nothing(runs_dir: Path, scale: str, notes: list[Note]) -> str:
 def _variant(checked: Checked, notes: list[Note]) -> Variant | None:
     """A checked folder's seeds in arrays; None if it can't be drawn, with a note."""
     folder, tables = checked.folder, list(checked.tables.values())
-    columns = tables[0] if tables else ()
-    family = family_of(columns)
+    if checked.findings:
+        notes.append(_incomplete(checked))
+    if not tables:
+        return None
+    family = family_of(tables[0])
     *_, counter = index = INDEX[family]
+    needed = FQI_METRICS.get(folder.parent.name, ()) if family == "FQI" else ()
+    if lacking := [name for name in needed if name not in tables[0]]:
+        text = f"does not record {listed(lacking)}: left out"
+        notes.append(Note.of(folder, text))
+        return None
     metrics = {
         str(name): np.stack([table[name].to_numpy() for table in tables])
-        for name in columns
+        for name in tables[0]
         if name not in index
     }
     for values in metrics.values():
         values[~np.isfinite(values)] = np.nan  # a gap, not a line to infinity
-    stage, task, index = (
-        np.array(columns[name] if tables else (), np.int64)
-        for name in ("stage", "task", counter)
-    )
     sidecars = tuple(checked.documents.values())
-    variant = Variant(
-        folder=folder,
-        family=family,
-        seeds=tuple(checked.tables),
-        stage=stage,
-        task=task,
-        index=index,
-        metrics=metrics,
-        sidecars=sidecars,
-        failed=checked.failed,
-    )
-    if checked.findings:
-        notes.append(_incomplete(checked, variant))
-    if not tables:
-        return None
-    needed = FQI_METRICS.get(variant.env, ()) if family == "FQI" else ()
-    lacking = [name for name in needed if name not in metrics]
-    odd = [f"does not record {listed(lacking)}: left out"] if lacking else []
-    for text in odd or _mixed_code(variant):
-        notes.append(_note(variant, text))
-    if lacking:
-        return None
-    if far := diverging(metrics):
-        which = ", ".join(f"{name} up to {value:.3g}" for name, value in far.items())
-        notes.append(
-            _note(variant, f"diverges, {which}", f"{folder.name} diverges ({which})")
-        )
-    return variant
-
-
-def _note(variant: Variant, text: str, footer: str = "", **more: object) -> Note:
-    whole = f"{variant.folder}: {text}"
-    return Note(whole, variant.env, variant.tag, footer, variant.method, **more)
-
-
-def _incomplete(checked: Checked, variant: Variant) -> Note:
-    """How many requested seeds are complete, and what is the matter with others."""
-    failed = f" ({len(checked.failed)} failed)" if checked.failed else ""
-    count = f"{len(checked.tables)} of {len(checked.requested)} seeds"
-    why = "; ".join(f"{f.path.name} {f.what}" for f in checked.findings)
-    compared = (
-        family
-        for (env, family), names in COMPARED.items()
-        if env == variant.env and variant.method in names
-    )
-    return _note(
-        variant,
-        f"INCOMPLETE, {count} drawn: {why}",
-        f"{variant.name} {count}{failed}",
-        family=next(compared, None),
-        incomplete=True,
-    )
-
-
-def _mixed_code(variant: Variant) -> Iterator[str]:
-    """A sentence if a folder's seeds were computed by different code or libraries."""
     for what, entry, key in (
         ("git revisions", "git", "revision"),
         ("versions of numpy", "versions", "numpy"),
         ("versions of numba", "versions", "numba"),
     ):
-        found = {str(s.get(entry, {}).get(key))[:10] for s in variant.sidecars}
+        found = {str(s.get(entry, {}).get(key))[:10] for s in sidecars}
         if len(found) > 1:
-            yield f"seeds of different {what} ({listed(sorted(found))})"
+            text = f"seeds of different {what} ({listed(sorted(found))})"
+            notes.append(Note.of(folder, text))
+    if far := diverging(metrics):
+        which = ", ".join(f"{name} up to {value:.3g}" for name, value in far.items())
+        footer = f"{folder.name} diverges ({which})"
+        notes.append(Note.of(folder, f"diverges, {which}", footer))
+    stage, task, rows = (
+        tables[0][name].to_numpy().astype(np.int64)
+        for name in ("stage", "task", counter)
+    )
+    seeds, failed = tuple(checked.tables), checked.failed
+    return Variant(folder, family, seeds, stage, task, rows, metrics, sidecars, failed)
+
+
+def _incomplete(checked: Checked) -> Note:
+    """How many requested seeds are complete, and what is the matter with others."""
+    folder, failed = checked.folder, len(checked.failed)
+    count = f"{len(checked.tables)} of {len(checked.requested)} seeds"
+    why = "; ".join(f"{f.path.name} {f.what}" for f in checked.findings)
+    footer = f"{folder.name} {count}" + (f" ({failed} failed)" if failed else "")
+    note = Note.of(folder, f"INCOMPLETE, {count} drawn: {why}", footer, incomplete=True)
+    for (env, family), names in COMPARED.items():
+        if env == note.env and note.method in names:
+            return replace(note, family=family)
+    return note

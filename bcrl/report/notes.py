@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from bcrl.results.layout import spelled, variant_name
 
@@ -28,6 +29,13 @@ class Note:
     method: str | None = None
     family: str | None = None
     incomplete: bool = False
+
+    @classmethod
+    def of(cls, folder: Path, text: str, footer: str = "", **more: Any) -> Note:
+        """A note on the variant in `folder`."""
+        method, _, tag = folder.name.partition("@")
+        where = {"env": folder.parent.name, "tag": tag or None, "method": method}
+        return cls(f"{folder}: {text}", footer=footer, **where, **more)
 
 
 def listed(items: Iterable[object]) -> str:

@@ -7,16 +7,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from bcrl.common.identity import OUTPUT_KEYS, flat
 from bcrl.report.late import WINDOW, late
-from bcrl.report.statistics import bootstrap
 from bcrl.report.tables import ABSENT, Section, Table, mean_cell, seeds_cell
 from bcrl.report.variants import Runs, Variant
 from bcrl.results.layout import spelled
 
+#: The return that ranks variants, by family.
+DECISIVE = {"FQI": "last return", "DQN": "late return"}
 IGNORED = (*OUTPUT_KEYS, "scale")  # top-level keys of a config that all may differ in
 
 PREAMBLE = f"""\
@@ -45,28 +45,24 @@ class Group:
     @property
     def best(self) -> Variant | None:
         """The variant with the largest mean return, None if all are non-finite."""
-        means = [np.mean(decisive(variant)) for variant in self.variants]
-        best = int(np.argmax([v if np.isfinite(v) else -np.inf for v in means]))
-        return self.variants[best] if np.isfinite(means[best]) else None
+        ranked = {}
+        for variant in self.variants:
+            values = measured(variant)[DECISIVE[variant.family]]
+            if values is not None and np.isfinite(values.mean()):
+                ranked[variant.name] = values.mean()
+        best = max(ranked, key=lambda name: ranked[name], default=None)
+        return next((v for v in self.variants if v.name == best), None)
 
 
 def measured(variant: Variant) -> dict[str, NDArray[np.float64] | None]:
     """Late and last return and success rate, (S,) each; None for what FQI lacks."""
-    if variant.family == "DQN":
-        late_return, success = late(variant, "return"), late(variant, "success_rate")
-    else:
-        late_return = None
-        success = variant.last("solved") if "solved" in variant.metrics else None
-    last_return = variant.last("return") if "return" in variant.metrics else None
-    found = {"late return": late_return, "last return": last_return}
-    return found | {"success rate": success}
-
-
-def decisive(variant: Variant) -> NDArray[np.float64]:
-    """The return that ranks variants: late, for FQI the last, (S,); nan without one."""
-    name = "late return" if variant.family == "DQN" else "last return"
-    values = measured(variant)[name]
-    return np.full(len(variant.seeds), np.nan) if values is None else values
+    metrics, dqn = variant.metrics, variant.family == "DQN"
+    success = variant.last("solved") if "solved" in metrics else None
+    return {
+        "late return": late(variant, "return") if dqn else None,
+        "last return": variant.last("return") if "return" in metrics else None,
+        "success rate": late(variant, "success_rate") if dqn else success,
+    }
 
 
 def groups(runs: Runs) -> list[Group]:
@@ -76,73 +72,55 @@ def groups(runs: Runs) -> list[Group]:
         together.setdefault((variant.env, variant.method), []).append(variant)
     found = []
     for (env, method), variants in together.items():
+        texts = {v.name: _texts(v) for v in variants}
+        known = dict.fromkeys(key for each in texts.values() for key in each)
+        differ = [k for k in known if len({t.get(k) for t in texts.values()}) > 1]
+        settings = {
+            n: tuple(t.get(k, ABSENT) for k in differ) for n, t in texts.items()
+        }
         if len(variants) > 1:
-            configs = {v.name: _texts(v) for v in variants}
-            known = dict.fromkeys(key for texts in configs.values() for key in texts)
-            values = {
-                k: [texts.get(k, ABSENT) for texts in configs.values()] for k in known
-            }
-            keys = tuple(key for key in known if len(set(values[key])) > 1)
-            rows = (
-                zip(*(values[key] for key in keys), strict=True)
-                if keys
-                else ((),) * len(variants)
-            )
-            settings = dict(zip(configs, rows, strict=True))
-            found.append(Group(env, method, tuple(variants), keys, settings))
+            found.append(Group(env, method, tuple(variants), tuple(differ), settings))
     return found
 
 
 def _texts(variant: Variant) -> dict[str, str]:
     """Dotted keys of a variant's config → values as JSON, strings without quotes."""
     config = variant.sidecars[0].get("config") or {}
-    flattened = flat({k: v for k, v in config.items() if k not in IGNORED})
-    return {
-        key: json.dumps(value, ensure_ascii=False).strip('"')
-        for key, value in flattened.items()
-    }
+    kept = flat({k: v for k, v in config.items() if k not in IGNORED})
+    return {k: json.dumps(v, ensure_ascii=False).strip('"') for k, v in kept.items()}
 
 
 def sweep_sections(found: list[Group]) -> Iterator[Section]:
-    """The best of each group, then every group."""
-    header = ("environment", "method", "variants", "best", "its settings", "return")
-    rows = [_best_row(group) for group in found]
-    yield Section("Best", [Table([*header, "seeds · number"], rows)])
+    """Per group: how many variants, which is best, and a table of all."""
     for group in found:
         used = {spelled(variant.seeds) for variant in group.variants}
         same = f"Seeds {used.pop()}." if len(used) == 1 else "Seeds differ by row."
-        text = f"{len(group.variants)} variants. {same}\n"
-        yield Section(f"{group.env}: {group.method}", [text, _group_table(group)])
+        text = f"{len(group.variants)} variants. {same}"
+        if (best := group.best) is not None:
+            pairs = zip(group.keys, group.settings[best.name], strict=True)
+            chosen = ", ".join(f"{key} = {value}" for key, value in pairs)
+            text += f" Best: {best.name}{f' ({chosen})' if chosen else ''}."
+        rows = [_row(group, variant) for variant in group.variants]
+        header = [
+            "variant",
+            *group.keys,
+            "seeds · number",
+            *measured(group.variants[0]),
+        ]
+        table = Table(header, rows)
+        yield Section(f"{group.env}: {group.method}", [f"{text}\n", table])
 
 
-def _best_row(group: Group) -> list[str]:
-    best, row = group.best, [group.env, group.method, str(len(group.variants))]
-    if best is None:
-        return [*row, *[ABSENT] * 4]
-    pairs = zip(group.keys, group.settings[best.name], strict=True)
-    chosen = ", ".join(f"{key} = {value}" for key, value in pairs) or ABSENT
-    return [*row, best.name, chosen, mean_cell(decisive(best)), _seeds(best)]
-
-
-def _group_table(group: Group) -> Table:
-    rows = []
-    for variant in group.variants:
-        cells = [variant.name, *group.settings[variant.name], _seeds(variant)]
-        values = [mean_cell(values) for values in measured(variant).values()]
-        if variant is group.best:
-            place = 0 if variant.family == "DQN" else 1
-            values[place] = f"**{values[place]}**"
-        rows.append([*cells, *values])
-    header = ["variant", *group.keys, "seeds · number", "late return", "last return"]
-    return Table([*header, "success rate"], rows)
-
-
-def _seeds(variant: Variant) -> str:
-    return f"{spelled(variant.seeds)} · {seeds_cell(variant)}"
+def _row(group: Group, variant: Variant) -> list[str]:
+    seeds = f"{spelled(variant.seeds)} · {seeds_cell(variant)}"
+    cells = {name: mean_cell(values) for name, values in measured(variant).items()}
+    if variant is group.best:
+        cells[DECISIVE[variant.family]] = f"**{cells[DECISIVE[variant.family]]}**"
+    return [variant.name, *group.settings[variant.name], seeds, *cells.values()]
 
 
 def sweep_report(runs: Runs, found: list[Group]) -> str:
-    """The Markdown document: the best of each group, then every group."""
+    """The Markdown document of all groups, and the notes on their runs."""
     parts = [f"# Variants compared, scale {runs.scale}\n", PREAMBLE]
     parts += map(str, sweep_sections(found))
     ours = {(group.env, group.method) for group in found}
@@ -151,27 +129,3 @@ def sweep_report(runs: Runs, found: list[Group]) -> str:
         parts.append("## Notes on these runs\n")
         parts.append("\n".join(f"- {text}" for text in odd) + "\n")
     return "\n".join(parts)
-
-
-def sweep_table(found: list[Group]) -> pd.DataFrame:
-    """One row per variant: settings as JSON text, seeds, returns with intervals."""
-    rows = []
-    for group in found:
-        for variant in group.variants:
-            settings = zip(group.keys, group.settings[variant.name], strict=True)
-            row: dict[str, object] = {
-                "env": group.env,
-                "method": group.method,
-                "variant": variant.name,
-                "settings": json.dumps(dict(settings), ensure_ascii=False),
-                "seeds": spelled(variant.seeds),
-                "complete": len(variant.seeds),
-                "failed": len(variant.failed),
-            }
-            for name, values in measured(variant).items():
-                column, known = name.replace(" ", "_"), values is not None
-                mean, (low, high) = np.nan, bootstrap(values if known else [])
-                row |= {column: values.mean() if known else mean}
-                row |= {f"{column}_low": low, f"{column}_high": high}
-            rows.append(row | {"best": variant is group.best})
-    return pd.DataFrame(rows)

@@ -7,7 +7,7 @@ import sys
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from bcrl import __version__
 from bcrl.errors import BcrlError, closest
@@ -24,13 +24,9 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, prog: str, description: str) -> None:
         super().__init__(prog=prog, description=description)
         self.add_argument("--version", action="version", version=f"bcrl {__version__}")
-        self.add_argument(
-            "--runs-dir",
-            type=Path,
-            default=Path("runs"),
-            metavar="PATH",
-            help="the results, also runs_dir=PATH as bcrl has it; default: %(default)s",
-        )
+        text = "the results, also runs_dir=PATH as bcrl has it; default: %(default)s"
+        kind: dict[str, Any] = {"type": Path, "default": Path("runs"), "metavar": "PATH"}
+        self.add_argument("--runs-dir", help=text, **kind)
 
     def parsed(self, words: Sequence[str] | None = None) -> Namespace:
         """The options in `words` or on the command line; BcrlError for a bad one."""
@@ -57,18 +53,17 @@ class Parser(argparse.ArgumentParser):
         return flag + equals + value if known else word
 
     def _meant(self, word: str, after: str) -> str:
-        """What an unknown word may mean."""
+        """What an unknown word may mean, as the words to type."""
         key, _, value = word.lstrip("+-").partition("=")
         value, name = value or after, key.lower().replace("-", "_").rstrip(":")
         flags = self._flags()
-        scale = closest(word, SCALES, 0.8) if "--scale" in flags else None
-        if scale:
-            return f"did you mean --scale {scale}?"
-        if Path(word).is_dir() and not word.startswith("-"):
-            return f"did you mean runs_dir={word}?"
         flag = HABITS.get(name) or closest(f"--{name.replace('_', '-')}", flags, 0.6)
+        if "--scale" in flags and (scale := closest(word, SCALES, 0.8)):
+            flag, value = "--scale", scale
+        elif Path(word).is_dir() and not word.startswith("-"):
+            flag, value = "--runs-dir", word
         if flag not in flags:
             return f"see {self.prog} --help"
         if flag == "--runs-dir":
             return f"did you mean runs_dir={value or 'PATH'}?"
-        return f"did you mean {flag}{f' {value}' if value else ''}?"
+        return f"did you mean {' '.join(filter(None, (flag, value)))}?"

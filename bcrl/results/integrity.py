@@ -6,7 +6,7 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,20 +15,8 @@ import pandas as pd
 import yaml
 
 from bcrl.common.identity import differences, identity
-from bcrl.results.layout import (
-    COMPLETE,
-    CONFIG,
-    FAILED,
-    INDEX,
-    RUNNING,
-    SEED,
-    SUFFIXES,
-    family_of,
-    requested,
-    seed_path,
-    spelled,
-    state_of,
-)
+from bcrl.results import layout
+from bcrl.results.layout import requested, seed_path, state_of
 from bcrl.results.read import (
     AGAIN,
     INCOMPLETE,
@@ -42,6 +30,7 @@ from bcrl.results.read import (
 )
 
 SHOWN_KEYS = 3  # differing keys of a config that are named
+_NAME = re.compile(rf"{layout.SEED}([0-9]+)\.({'|'.join(layout.SUFFIXES)})")
 Documents = dict[int, Document]  # by seed
 
 
@@ -66,16 +55,12 @@ def check_tree(
 ) -> tuple[list[Checked], list[Finding]]:
     """All variants' folders of a scale, or of all, and all findings, broken first."""
     findings: list[Finding] = []
-    scales = [runs_dir / scale] if scale else _subfolders(runs_dir, findings)
-    environments = [env for path in scales for env in _subfolders(path, findings)]
-    folders = [path for env in environments for path in _subfolders(env, findings)]
-    variants = [check_folder(folder) for folder in folders]
+    folders = [runs_dir / scale] if scale else _entries(runs_dir, findings)
+    for _ in ("environments", "variants"):
+        folders = [path for folder in folders for path in _entries(folder, findings)]
+    variants = [check_folder(folder) for folder in folders if folder.is_dir()]
     findings += [finding for variant in variants for finding in variant.findings]
     return variants, sorted(findings, key=lambda finding: finding.kind == INCOMPLETE)
-
-
-def _subfolders(folder: Path, findings: list[Finding]) -> list[Path]:
-    return [path for path in _entries(folder, findings) if path.is_dir()]
 
 
 def _entries(folder: Path, findings: list[Finding]) -> list[Path]:
@@ -94,51 +79,62 @@ def _entries(folder: Path, findings: list[Finding]) -> list[Path]:
 
 def check_folder(folder: Path) -> Checked:
     """Every file of `<runs_dir>/<scale>/<env>/<variant>[@tag]`, checked."""
-    result = Checked(folder)
-    findings = result.findings
-    numbers = _numbers(folder, findings)
-    documents: Documents = {}
+    result, numbers = Checked(folder), set()
+    findings, documents = result.findings, Documents()
+    for path in _entries(folder, findings):
+        match = _NAME.fullmatch(path.name)
+        if match and path == seed_path(folder, int(match[1]), match[2]):
+            numbers.add(int(match[1]))
+        elif path.name.startswith(layout.SEED):
+            what = "is not a name that bcrl gives"
+            findings.append(Finding(path, what, "move it out of the folder"))
     for seed in sorted(numbers):
-        try:
-            documents[seed] = read_document(folder, seed)
-        except BadFile as error:
-            findings.append(error.finding)
-    findings += _config_findings(folder, documents)
-    for seed, document in documents.items():
         csv, npz = (seed_path(folder, seed, suffix) for suffix in ("csv", "npz"))
-        state = state_of(document)
         try:
-            if state != RUNNING and "sha256" in document:
+            documents[seed] = document = read_document(folder, seed)
+            state = state_of(document)
+            if state != layout.RUNNING and "sha256" in document:
                 read_recorded(npz, document)
                 read_recorded(csv, document)
-            if state == COMPLETE:
-                table = read_csv(csv, document)
-                result.tables[seed], result.documents[seed] = table, document
+            if state == layout.COMPLETE:
+                result.tables[seed] = read_csv(csv, document)
+                result.documents[seed] = document
+            if state == layout.FAILED:
+                result.failed += (seed,)
         except BadFile as error:
             findings.append(error.finding)
-    findings += _index_findings(folder, result.tables)
-    result.failed = tuple(s for s, d in documents.items() if state_of(d) == FAILED)
     result.requested = frozenset().union(*map(requested, documents.values()))
-    findings += _incomplete_findings(folder, numbers, documents, result.requested)
+    findings += _config_findings(folder, documents)
+    findings += _index_findings(folder, result.tables)
+    findings += _unfinished(folder, documents)
+    if missing := sorted(result.requested - numbers):
+        made = (d for d in documents.values() if missing[0] in requested(d))
+        typed = next(filter(None, map(command_of, made)), "")
+        what = f"lacks seed{'s' * (len(missing) > 1)} {layout.spelled(missing)}"
+        remedy = AGAIN + (f" (`{typed}`)" if typed else "")
+        what += ", which a command was to make"
+        findings.append(Finding(folder, what, remedy, INCOMPLETE))
+    if not numbers:
+        remedy = f"{AGAIN}, or move the folder away"
+        findings.append(Finding(folder, "has no seeds", remedy, INCOMPLETE))
     return result
 
 
-def _numbers(folder: Path, findings: list[Finding]) -> set[int]:
-    """The seeds that any file is named after; misnamed files are findings."""
-    numbers = set()
-    for path in _entries(folder, findings):
-        match = re.fullmatch(rf"{SEED}([0-9]+)\.({'|'.join(SUFFIXES)})", path.name)
-        if match and path == seed_path(folder, int(match[1]), match[2]):
-            numbers.add(int(match[1]))
-        elif path.name.startswith(SEED):
-            what = "is not a name that bcrl gives"
-            findings.append(Finding(path, what, "move it out of the folder"))
-    return numbers
+def _unfinished(folder: Path, documents: Documents) -> Iterator[Finding]:
+    """Seeds that were begun or have failed."""
+    for seed, document in documents.items():
+        path = seed_path(folder, seed, "json")
+        if state_of(document) == layout.RUNNING:
+            what = 'says "running": it is being computed, or its process was killed'
+            yield Finding(path, what, AGAIN, INCOMPLETE)
+        if state_of(document) == layout.FAILED:
+            remedy = f"{AGAIN} to try it again, or leave it out"
+            yield Finding(path, f'says "{document["status"]}"', remedy, INCOMPLETE)
 
 
 def _config_findings(folder: Path, documents: Documents) -> list[Finding]:
     """Where config.yaml and the seeds' configs differ in what decides numbers."""
-    path = folder / CONFIG
+    path = folder / layout.CONFIG
     anew = f"put it back, or delete {folder} and {AGAIN}"
     try:
         config = yaml.safe_load(path.read_bytes())
@@ -150,14 +146,12 @@ def _config_findings(folder: Path, documents: Documents) -> list[Finding]:
         return [Finding(path, what, anew)]
     made = {seed: document["config"] for seed, document in documents.items()}
     odd = {seed: _text(each) for seed, each in made.items() if _text(each) != text}
+    changed = {seed: _changed(config, made[seed]) for seed in odd}
     if odd and len(odd) == len(made) and len(set(odd.values())) == 1:
-        what = f"is not its seeds' config ({_changed(config, made[min(odd)])})"
+        what = f"is not its seeds' config ({changed[min(odd)]})"
         return [Finding(path, what, anew)]
-    return [
-        _mixed(folder, seed, "json", f"has another config than {CONFIG} ({changed})")
-        for seed in odd
-        for changed in [_changed(config, made[seed])]
-    ]
+    other = f"has another config than {layout.CONFIG}"
+    return [_odd(folder, seed, "json", f"{other} ({changed[seed]})") for seed in odd]
 
 
 def _text(config: dict[str, Any]) -> str:
@@ -173,59 +167,28 @@ def _changed(config: dict[str, Any], made: dict[str, Any]) -> str:
     return "; ".join(shown + [f"and {more} more"] * (more > 0)) or "types of values"
 
 
-def _mixed(folder: Path, seed: int, suffix: str, what: str) -> Finding:
+def _odd(folder: Path, seed: int, suffix: str, what: str) -> Finding:
     """A seed that is not of the same origin as the others in its folder."""
     remedy = f"delete {seed_path(folder, seed, '*')} and {AGAIN}"
     return Finding(seed_path(folder, seed, suffix), what, remedy)
 
 
-def _index_findings(
-    folder: Path, tables: Mapping[int, pd.DataFrame]
-) -> Iterator[Finding]:
+def _index_findings(folder: Path, tables: dict[int, pd.DataFrame]) -> Iterator[Finding]:
     """Seeds whose stages, tasks or counters are not those of most."""
-    indices = {seed: t[list(INDEX[family_of(t)])] for seed, t in tables.items()}
-    keys = {s: (*i.columns, i.to_numpy().tobytes()) for s, i in indices.items()}
-    for usual, _ in Counter(keys.values()).most_common(1):
-        model = next(seed for seed in keys if keys[seed] == usual)
-        for seed in keys:
-            if keys[seed] != usual:
-                where = _differing(indices[seed], indices[model])
-                yield _mixed(
-                    *(folder, seed, "csv"),
-                    f"differs from {seed_path(folder, model, 'csv').name} in its "
-                    f"{where}, so the folder mixes two configurations or versions",
-                )
-
-
-def _differing(index: pd.DataFrame, model: pd.DataFrame) -> str:
-    if len(index) != len(model):
-        return f"length ({len(index)} rows, not {len(model)})"
-    differ = [str(c) for c in model if list(model[c]) != list(index.get(c, []))]
-    return f"{' and '.join(differ)} column{'s' * (len(differ) > 1)}"
-
-
-def _incomplete_findings(
-    folder: Path, numbers: set[int], documents: Documents, wanted: Iterable[int]
-) -> Iterator[Finding]:
-    """Seeds that are not complete: begun, failed, or requested and absent."""
-    for seed, document in documents.items():
-        path, state = seed_path(folder, seed, "json"), state_of(document)
-        if state == RUNNING:
-            what = 'says "running": it is being computed, or its process was killed'
-            yield Finding(path, what, AGAIN, INCOMPLETE)
-        if state == FAILED:
-            what = f'says "{document["status"]}"'
-            remedy = f"{AGAIN} to try it again, or leave it out"
-            yield Finding(path, what, remedy, INCOMPLETE)
-    missing = sorted(set(wanted) - numbers)
-    if missing:
-        made = (d for d in documents.values() if missing[0] in requested(d))
-        typed = next(filter(None, map(command_of, made)), "")
-        noun = "seed" if len(missing) == 1 else "seeds"
-        what = f"lacks {noun} {spelled(missing)}, which a command was to make"
-        yield Finding(
-            folder, what, AGAIN + (f" (`{typed}`)" if typed else ""), INCOMPLETE
-        )
-    if not numbers:
-        remedy = f"{AGAIN}, or move the folder away"
-        yield Finding(folder, "has no seeds", remedy, INCOMPLETE)
+    columns = {s: layout.INDEX[layout.family_of(t)] for s, t in tables.items()}
+    keys = {
+        s: (columns[s], t[[*columns[s]]].to_numpy().tobytes())
+        for s, t in tables.items()
+    }
+    usual = Counter(keys.values()).most_common(1)
+    odd = [seed for seed in keys if keys[seed] != usual[0][0]]
+    for seed in odd:
+        model = next(other for other in keys if keys[other] == usual[0][0])
+        mine, theirs = tables[seed], tables[model]
+        names = [c for c in columns[model] if list(mine.get(c, ())) != list(theirs[c])]
+        where = f"{' and '.join(names)} column{'s' * (len(names) > 1)}"
+        if len(mine) != len(theirs):
+            where = f"length ({len(mine)} rows, not {len(theirs)})"
+        what = f"differs from {seed_path(folder, model, 'csv').name} in its {where}"
+        mixed = ", so the folder mixes two configurations or versions"
+        yield _odd(folder, seed, "csv", what + mixed)

@@ -17,22 +17,7 @@ from numpy.typing import NDArray
 
 from bcrl.common.files import is_intact, sha256
 from bcrl.errors import BcrlError
-from bcrl.results.layout import (
-    COMPLETE,
-    DQN_METRICS,
-    FAILED,
-    FQI_METRICS,
-    INDEX,
-    MAY_BE_NAN,
-    RUNNING,
-    SCHEMA,
-    belongs_to,
-    family_of,
-    requested,
-    seed_path,
-    seeds_of,
-    state_of,
-)
+from bcrl.results import layout
 
 BROKEN, INCOMPLETE = "broken", "incomplete"  # kinds of findings
 AGAIN = "run the same command again"
@@ -71,7 +56,7 @@ def bad_file(path: Path, what: str, remedy: str = "") -> BadFile:
 
 def read_document(folder: Path, seed: int) -> Document:
     """A seed's JSON; BadFile unless it is whole, unchanged and in its place."""
-    path = seed_path(folder, seed, "json")
+    path = layout.seed_path(folder, seed, "json")
     try:
         document = json.loads(_bytes(path))
         intact = isinstance(document, dict) and is_intact(document)
@@ -79,31 +64,35 @@ def read_document(folder: Path, seed: int) -> Document:
         raise bad_file(path, "is not readable JSON") from error
     if not isinstance(document, dict):
         raise bad_file(path, "is not a JSON object")
-    if document.get("schema") != SCHEMA:
-        what = f"has schema {document.get('schema')!r}, this version reads {SCHEMA}"
+    if document.get("schema") != layout.SCHEMA:
+        what = (
+            f"has schema {document.get('schema')!r}, this version reads {layout.SCHEMA}"
+        )
         raise bad_file(path, what)
     if not intact:
         raise bad_file(path, "was changed after it was written (see its digest)")
-    for key, value in belongs_to(folder, seed).items():
+    for key, value in layout.belongs_to(folder, seed).items():
         if document.get(key) != value:
             what = f"belongs to {key} {document.get(key)!r}, not {value!r}"
             back = f"move it back, or delete {path.with_suffix('')}.* and {AGAIN}"
             raise bad_file(path, what, back)
     if not _has_the_schema(document):
-        raise bad_file(path, f"lacks entries of schema {SCHEMA}")
+        raise bad_file(path, f"lacks entries of schema {layout.SCHEMA}")
     return document
 
 
 def _has_the_schema(document: Document) -> bool:
     """Whether the entries that are relied on are there."""
     try:
-        requested(document)
+        layout.requested(document)
         metrics = document["config"]["env"]["metrics"]
-        state, hashes = state_of(document), document.get("sha256")
-        # A seed that failed may have done so before it had files.
-        hashed = state == RUNNING or (state == FAILED and hashes is None)
-        known = state in (RUNNING, COMPLETE, FAILED) and isinstance(metrics, list)
-        return known and (hashed or {"csv", "npz"} <= (hashes or {}).keys())
+        state, hashes = layout.state_of(document), document.get("sha256")
+        # A seed that is running or failed may not have files yet.
+        if state == layout.RUNNING or (state == layout.FAILED and hashes is None):
+            return isinstance(metrics, list)
+        hashed = {"csv", "npz"} <= (hashes or {}).keys()
+        known = state in (layout.COMPLETE, layout.FAILED)
+        return hashed and known and isinstance(metrics, list)
     except (KeyError, TypeError, AttributeError):
         return False
 
@@ -150,20 +139,20 @@ def read_csv(path: Path, document: Document) -> pd.DataFrame:
         table = table.astype(float)
     except ValueError as error:
         raise bad_file(path, f"holds something not a number ({error})") from error
-    family = family_of(table)
-    metrics: tuple[str, ...] = DQN_METRICS
+    family = layout.family_of(table)
+    metrics: tuple[str, ...] = layout.DQN_METRICS
     known = metrics
     if family == "FQI":
         metrics = tuple(dict.fromkeys(document["config"]["env"]["metrics"]))
-        known = FQI_METRICS.get(document["env"], ())
-    expected = [str(column) for column in (*INDEX[family], *metrics)]
+        known = layout.FQI_METRICS.get(document["env"], ())
+    expected = [str(column) for column in (*layout.INDEX[family], *metrics)]
     if list(table.columns) != expected:
         found = ",".join(table.columns)
         raise bad_file(path, f"has the header {found}, expected {','.join(expected)}")
     if what := _disorder(table):
         raise bad_file(path, what)
     for name in known:
-        if name in table and name not in MAY_BE_NAN:
+        if name in table and name not in layout.MAY_BE_NAN:
             bad = np.flatnonzero(~np.isfinite(table[name].to_numpy()))
             if len(bad):
                 raise bad_file(path, f"has a non-finite {name} in row {bad[0] + 1}")
@@ -208,9 +197,9 @@ def read_folder(folder: str | Path) -> pd.DataFrame:
 
     BcrlError if there are none.
     """
-    numbers = seeds_of(Path(folder), "csv")
+    numbers = layout.seeds_of(Path(folder), "csv")
     if not numbers:
         raise BcrlError(f"{folder}: there is no seed_*.csv")
-    found = {n: pd.read_csv(seed_path(Path(folder), n, "csv")) for n in numbers}
+    found = {n: pd.read_csv(layout.seed_path(Path(folder), n, "csv")) for n in numbers}
     together = pd.concat(found, names=["seed", None])
     return together.reset_index("seed").reset_index(drop=True)

@@ -13,6 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from bcrl.common.signals import Interrupted
 from bcrl.errors import ConfigError
 from bcrl.results import loggers
+from bcrl.results.layout import LOGS
 from bcrl.results.integrity import check_tree
 from bcrl.run import runner
 from tests.conftest import plan
@@ -43,7 +44,7 @@ class Writer:
 
 def logged(root: Path, seed: int, folder: str = "maze/BC-FQI") -> dict:
     """Name of a metric → its (step, value) in the event files."""
-    run = root / loggers.FOLDER / "smoke" / folder / f"seed_{seed:04d}"
+    run = root / LOGS / "smoke" / folder / f"seed_{seed:04d}"
     events = EventAccumulator(str(run), {"scalars": 0}).Reload()
     names = events.Tags()["scalars"]
     return {n: [(e.step, e.value) for e in events.Scalars(n)] for n in names}
@@ -80,7 +81,7 @@ def test_the_same_bytes_with_and_without(tmp_path):
             )
             assert first == second
         check(tmp_path / "logged", seed)
-    assert not (tmp_path / "plain" / loggers.FOLDER).exists()
+    assert not (tmp_path / "plain" / LOGS).exists()
     variants, findings = check_tree(tmp_path / "logged")
     assert (len(variants), findings) == (1, [])
 
@@ -97,7 +98,7 @@ def test_an_interrupted_run_logs_nothing_twice(tmp_path, monkeypatch):
     """Stopped after a while, gone on with in a new event file."""
     from bcrl.run import job as training
 
-    look, seen = training._look, []
+    look, seen = training._measure, []
 
     def counted(probe, now, session, log):
         look(probe, now, session, log)
@@ -107,7 +108,7 @@ def test_an_interrupted_run_logs_nothing_twice(tmp_path, monkeypatch):
 
     stops = []
     train = training.train
-    monkeypatch.setattr(training, "_look", counted)
+    monkeypatch.setattr(training, "_measure", counted)
     monkeypatch.setattr(
         training,
         "train",
@@ -119,7 +120,7 @@ def test_an_interrupted_run_logs_nothing_twice(tmp_path, monkeypatch):
     assert [step for step, _ in logged(tmp_path, 1)["return"]] == list(range(1, 8))
     run(tmp_path, *arguments)
     assert seen == list(range(1, 21))
-    folder = tmp_path / loggers.FOLDER / "smoke/maze/BC-FQI/seed_0001"
+    folder = tmp_path / LOGS / "smoke/maze/BC-FQI/seed_0001"
     assert len(list(folder.iterdir())) == 2
     for seed in (0, 1):
         check(tmp_path, seed)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.report.claims.judge import FEWEST_SEEDS
-from bcrl.report.claims.paper import car_claims, linear_claims, maze_claims
+from bcrl.report.claims.paper import CAR_CLAIMS, LINEAR_CLAIMS, MAZE_CLAIMS
 from bcrl.report.late import LINEAR, WINDOW, area, late
 from bcrl.report.notes import Note, incomplete, tags_shown
 from bcrl.report.statistics import interquartile_mean, share_interval
@@ -24,12 +24,14 @@ from bcrl.report.tables import (
 )
 from bcrl.report.variants import Methods, Runs, Variant
 
-HEADER = ("claim", "quantity", "expected", "estimate [95 % interval]", "seeds")
-HEADER = (*HEADER, "verdict")
+HEADER = (
+    *("claim", "quantity: method, or difference of two", "expected"),
+    *("estimate [95 % interval]", "seeds", "verdict"),
+)
 SECTIONS = {
-    ("car_on_hill", "FQI"): ("Car on the hill (§6.1, Fig. 1)", car_claims),
-    ("maze", "FQI"): ("Maze (§6.2 and C.2, Figs. 2, 3, 5)", maze_claims),
-    (LINEAR, "DQN"): ("Linear system (§6.3 and C.3, Fig. 4)", linear_claims),
+    ("car_on_hill", "FQI"): ("Car on the hill (§6.1, Fig. 1)", CAR_CLAIMS),
+    ("maze", "FQI"): ("Maze (§6.2 and C.2, Figs. 2, 3, 5)", MAZE_CLAIMS),
+    (LINEAR, "DQN"): ("Linear system (§6.3 and C.3, Fig. 4)", LINEAR_CLAIMS),
 }
 
 PREAMBLE = f"""\
@@ -76,7 +78,7 @@ def claims_sections(runs: Runs, tag: str | None) -> dict[tuple[str, str], Sectio
         parts: list[str | Table] = []
         if len({variant.tag for variant in methods.values()}) > 1:
             parts.append(f"{tags_shown(methods)}; the others are untagged.\n")
-        rows = [claim.row(methods) for claim in claims()]
+        rows = [claim.row(methods) for claim in claims]
         parts += [_tally([row[-1] for row in rows]), Table(HEADER, rows)]
         parts += _fqi_values(methods) if family == "FQI" else _dqn_values(methods)
         seconds = sum(variant.cpu_seconds for variant in methods.values())
@@ -96,8 +98,7 @@ def _fqi_values(methods: Methods) -> list[str | Table]:
     """Every metric after the last iteration and at every stage's end."""
     if not methods:
         return []
-    known = [set(variant.metrics) for variant in methods.values()]
-    common = set.intersection(*known)
+    common = set.intersection(*(set(v.metrics) for v in methods.values()))
     metrics = [m for m in ("q_error", "q_error_start", "return") if m in common]
     columns = {"seeds": lambda v: str(len(v.seeds))}
     columns |= {m: lambda v, m=m: mean_cell(v.last(m)) for m in metrics}

@@ -16,7 +16,7 @@ from bcrl.report.statistics import (
     share_interval,
 )
 from bcrl.report.tables import ABSENT, estimate
-from bcrl.report.variants import Methods
+from bcrl.report.variants import Methods, Variant
 
 #: Below this a percentile bootstrap is far too narrow: no verdict is given.
 FEWEST_SEEDS = 5
@@ -27,90 +27,80 @@ class NotMeasurable(Exception):
 
 
 @dataclass(frozen=True)
-class Measured:
-    """An estimate with its interval; `detail` is printed after it."""
+class Quantity:
+    """What is measured of a variant: `of` gives (S,) values, or hits to be counted."""
 
-    value: float
-    interval: Interval
-    detail: str = ""
+    words: str
+    of: Callable[[Variant], NDArray]
+    statistic: Callable[..., NDArray[np.float64]] = np.mean
 
 
 @dataclass(frozen=True)
 class Claim:
     """One sentence of the paper and the quantity that decides it.
 
-    `expect` is what the claim says of the quantity: "< 0", "> 0", "≤ 0", "> ½" or
-    "= 0". For the first four the whole interval decides; "= 0" is a statement about
-    every single seed, so that the count decides. `measure` takes the variants of the
-    methods that the claim `needs`.
+    The quantity is that of one method, or its difference between two. `expect` is what
+    the claim says of it: "< 0", "> 0", "≤ 0", "> ½" or "= 0". For the first four the
+    whole interval decides; "= 0" is a statement about every single seed, so that the
+    count decides.
     """
 
     statement: str
-    quantity: str
+    quantity: Quantity
     expect: str
-    needs: tuple[str, ...]
-    measure: Callable[..., Measured]
+    methods: tuple[str, ...]
 
-    def row(self, methods: Methods) -> list[str]:
+    def row(self, runs: Methods) -> list[str]:
         """Statement, quantity, expectation, estimate, seeds, verdict: a table row."""
-        absent = [name for name in self.needs if name not in methods]
-        used = [methods[name] for name in self.needs if name in methods]
+        absent = [name for name in self.methods if name not in runs]
+        used = [runs[name] for name in self.methods if name in runs]
         counts = [len(variant.seeds) for variant in used]
         seeds = " / ".join(map(str, dict.fromkeys(counts))) or "0"
-        cells = [self.statement, self.quantity, self.expect]
+        words = f"{self.quantity.words}: {' − '.join(self.methods)}"
+        cells = [self.statement, words, self.expect]
         if absent:
             return [*cells, ABSENT, seeds, f"no runs of {listed(absent)}"]
         try:
-            measured = self.measure(*used)
+            value, interval, detail = _measured(self.quantity, used)
         except NotMeasurable as reason:
             return [*cells, ABSENT, seeds, f"not measurable: {reason}"]
-        shown = estimate(measured.value, measured.interval) + measured.detail
-        return [*cells, shown, seeds, verdict(measured, self.expect, min(counts))]
+        shown = estimate(value, interval) + detail
+        return [
+            *cells,
+            shown,
+            seeds,
+            verdict(value, interval, self.expect, min(counts)),
+        ]
 
 
-def verdict(measured: Measured, expect: str, seeds: int) -> str:
+def _measured(
+    quantity: Quantity, variants: list[Variant]
+) -> tuple[float, Interval, str]:
+    """An estimate, its interval, and the counts of seeds if it is of shares."""
+    values = [quantity.of(variant) for variant in variants]
+    first, *rest = (float(quantity.statistic(each)) for each in values)
+    value = first - rest[0] if rest else first
+    if values[0].dtype != bool:
+        return value, bootstrap(*values, statistic=quantity.statistic), ""
+    (hits, n), *others = counts = [(int(v.sum()), len(v)) for v in values]
+    if others:
+        shown = " against ".join(f"{k}/{n}" for k, n in counts)
+        return value, share_difference_interval(hits, n, *others[0]), f" ({shown})"
+    return value, share_interval(hits, n), f" ({hits} of {n} seeds)"
+
+
+def verdict(value: float, interval: Interval, expect: str, seeds: int) -> str:
     """`holds`, `does not hold` or `undecided`, with the reason for no verdict."""
-    if not np.isfinite(measured.value):
+    if not np.isfinite(value):
         return "undecided (non-finite values)"
     if seeds < FEWEST_SEEDS:
         return f"undecided (fewer than {FEWEST_SEEDS} seeds)"
-    if expect == "= 0":
-        return "holds" if measured.value == 0 else "does not hold"
-    low, high = measured.interval
-    threshold = 0.5 if expect == "> ½" else 0.0
-    if expect.startswith(">"):
-        holds, fails = low > threshold, high <= threshold
-    elif expect.startswith("<"):
-        holds, fails = high < threshold, low >= threshold
-    else:
-        holds, fails = high <= threshold, low > threshold
+    low, high = interval
+    holds, fails = {
+        "= 0": (value == 0, value != 0),
+        "> ½": (low > 0.5, high <= 0.5),
+        "> 0": (low > 0, high <= 0),
+        "< 0": (high < 0, low >= 0),
+        "≤ 0": (high <= 0, low > 0),
+    }[expect]
     return "holds" if holds else "does not hold" if fails else "undecided"
-
-
-def within(values: NDArray[np.float64], detail: str = "") -> Measured:
-    """Mean of (S,) values of the same seeds, such as changes within a run."""
-    return Measured(float(values.mean()), bootstrap(values), detail)
-
-
-def between(
-    first: NDArray[np.float64],
-    second: NDArray[np.float64],
-    statistic: Callable[..., NDArray[np.float64]] = np.mean,
-) -> Measured:
-    """statistic(first) − statistic(second) of two methods' seeds."""
-    value = float(statistic(first) - statistic(second))
-    return Measured(value, bootstrap(first, second, statistic))
-
-
-def share(hits: NDArray[np.bool_], detail: str = "") -> Measured:
-    """Share of seeds, with Wilson's interval."""
-    count, n = int(hits.sum()), len(hits)
-    shown = f" ({count} of {n} seeds{detail})"
-    return Measured(count / n, share_interval(count, n), shown)
-
-
-def share_difference(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> Measured:
-    """Difference of two methods' shares of seeds, with Newcombe's interval."""
-    (k1, n1), (k2, n2) = ((int(h.sum()), len(h)) for h in (first, second))
-    interval = share_difference_interval(k1, n1, k2, n2)
-    return Measured(k1 / n1 - k2 / n2, interval, f" ({k1}/{n1} against {k2}/{n2})")

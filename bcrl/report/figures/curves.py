@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -56,42 +55,6 @@ def two_errors(values: NDArray[np.float64]) -> Interval:
     return centre - half, centre + half
 
 
-@dataclass(frozen=True)
-class Curve:
-    """A metric of a variant at (P,) of its evaluations: mean and interval over seeds.
-
-    `rows` are the evaluations' places in the variant's arrays.
-    """
-
-    variant: Variant
-    metric: str
-    rows: NDArray[np.intp]
-    interval: Callable[[NDArray[np.float64]], Interval] = bootstrap_curves
-
-    @property
-    def x(self) -> NDArray[np.int64]:
-        """Iterations or environment steps, (P,)."""
-        return self.variant.index[self.rows]
-
-    @property
-    def values(self) -> NDArray[np.float64]:
-        """Every seed's values, (S, P)."""
-        return self.variant.metrics[self.metric][:, self.rows]
-
-    @property
-    def diverges(self) -> bool:
-        """Whether an axis should leave it out."""
-        return self.metric in diverging(self.variant.metrics)
-
-    def draw(self, axes: Axes, method: str) -> list[NDArray[np.float64]]:
-        """A mean line with a band around it; what is drawn, (P,) each."""
-        centre, (low, high) = mean(self.values), self.interval(self.values)
-        fill = {"color": style.colour(method), "alpha": 0.25, "linewidth": 0}
-        axes.fill_between(self.x, low, high, **fill)
-        axes.plot(self.x, centre, linewidth=1.6, **style.line_of(method))
-        return [centre, low, high]
-
-
 def every(variant: Variant) -> NDArray[np.intp]:
     """All rows."""
     return np.arange(len(variant.stage))
@@ -112,27 +75,26 @@ def draw_metric(
     rows: Callable[[Variant], NDArray[np.intp]] = every,
     interval: Callable[[NDArray[np.float64]], Interval] = two_errors,
 ) -> None:
-    """A metric's curve of every method that has it; diverging ones are cut off."""
+    """Every method's mean over seeds with a band; diverging curves are cut off."""
     far, within = [], []
     for name, variant in methods.items():
         if metric in variant.metrics:
-            found = Curve(variant, metric, rows(variant), interval)
-            drawn = found.draw(axes, name)
-            far += [name] * found.diverges
-            within += [] if found.diverges else drawn
+            at, line = rows(variant), style.line_of(name)
+            x, values = variant.index[at], variant.metrics[metric][:, at]
+            centre, (low, high) = mean(values), interval(values)
+            fill = {"color": line["color"], "alpha": 0.25, "linewidth": 0}
+            axes.fill_between(x, low, high, **fill)
+            axes.plot(x, centre, linewidth=1.6, **line)
+            diverges = metric in diverging(variant.metrics)
+            far += [name] * diverges
+            within += [] if diverges else [centre, low, high]
     style.cut(axes, far, within)
 
 
 def metrics_of(methods: Methods) -> list[str]:
     """The metrics that a variant has any finite value of, in the CSVs' order."""
-    return list(
-        dict.fromkeys(
-            name
-            for variant in methods.values()
-            for name, values in variant.metrics.items()
-            if np.isfinite(values).any()
-        )
-    )
+    found = [item for variant in methods.values() for item in variant.metrics.items()]
+    return list(dict.fromkeys(name for name, v in found if np.isfinite(v).any()))
 
 
 def shared_spans(methods: Methods) -> list[style.Span]:
@@ -174,7 +136,11 @@ def _panels(
     """Panels side by side over the iterations, tasks shaded."""
     figure = Figure(figsize=size)
     panels = list(figure.subplots(1, len(labels), squeeze=False)[0])
-    spans = style.stage_spans(methods.values())
+    # Of the longest variants the one with most tasks, hence one with a curriculum.
+    longest = max(
+        methods.values(), key=lambda v: (len(v.stage), len(np.unique(v.task)))
+    )
+    spans = style.task_spans(longest)
     for axes, ylabel in zip(panels, labels, strict=True):
         style.shade_tasks(axes, spans)
         axes.set(xlabel="iteration", ylabel=ylabel)

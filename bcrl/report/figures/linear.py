@@ -10,7 +10,7 @@ from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 
 from bcrl.report.figures import style
-from bcrl.report.figures.curves import Curve, draw_metric, two_errors
+from bcrl.report.figures.curves import draw_metric
 from bcrl.report.late import (
     LEARNERS,
     LINEAR,
@@ -57,8 +57,8 @@ def _draw_pretraining(axes: Axes, methods: Methods) -> None:
     handles = []
     for learner, variant in pretraining(methods).items():
         source, n = SOURCES[learner], len(variant.seeds)
-        rows = pretraining_rows(variant)
-        Curve(variant, "discounted_return", rows, two_errors).draw(axes, source)
+        shown = {source: variant}
+        draw_metric(axes, shown, "discounted_return", pretraining_rows)
         label = f"{LEARNERS[learner]}, {n} seed{'s' * (n != 1)}"
         line = {"color": style.colour(source), "linewidth": 2, "label": label}
         handles.append(Line2D([], [], **line))

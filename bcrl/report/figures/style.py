@@ -6,6 +6,7 @@ import itertools
 import textwrap
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -86,16 +87,6 @@ def dashed(method: str) -> bool:
 def line_of(method: str) -> dict[str, Any]:
     """Colour and dashes of a method's line, for matplotlib."""
     return {"color": colour(method), "linestyle": "--" if dashed(method) else "-"}
-
-
-def stage_spans(variants: Iterable[Variant]) -> list[Span]:
-    """Name and extent, on the iteration axis, of every task of the longest variant.
-
-    Of equally long ones it is the one with most tasks, hence one with a curriculum.
-    """
-    return task_spans(
-        max(variants, key=lambda v: (len(v.stage), len(np.unique(v.task))))
-    )
 
 
 def task_spans(variant: Variant) -> list[Span]:
@@ -193,16 +184,10 @@ def colour_bar(axes: Axes, image: Any, shrink: float, aspect: float) -> Any:
 def save(figure: Figure, folder: Path, name: str, title: str) -> list[Path]:
     """Write `name`.png and `name`.pdf, atomically and without a date inside."""
     software = f"bcrl {__version__}"
-    metadata = {
-        "png": {"Title": title, "Software": software},
-        "pdf": {"Title": title, "Creator": software, "CreationDate": None},
-    }
-    return [
-        write_atomically(
-            folder / f"{name}.{kind}",
-            lambda handle, kind=kind: figure.savefig(
-                handle, format=kind, dpi=DPI, metadata=metadata[kind]
-            ),
-        )
-        for kind in metadata
-    ]
+    pdf = {"Title": title, "Creator": software, "CreationDate": None}
+    files = []
+    for kind, about in (("png", {"Title": title, "Software": software}), ("pdf", pdf)):
+        options = {"format": kind, "dpi": DPI, "metadata": about}
+        write = partial(figure.savefig, **options)
+        files.append(write_atomically(folder / f"{name}.{kind}", write))
+    return files
