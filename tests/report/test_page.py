@@ -68,12 +68,6 @@ def write_own(root: Path, env: str = OWN) -> None:
         write_seeds(made, lambda s, a=stages, b=tasks: dqn_table(s, a, b))
 
 
-@pytest.fixture
-def own(tmp_path: Path) -> Path:
-    write_own(tmp_path)
-    return tmp_path
-
-
 @pytest.fixture(scope="module")
 def reported(tmp_path_factory) -> Path:
     """Runs in one's own environment with everything that bcrl-report makes of them."""
@@ -105,18 +99,6 @@ def data_of(page: str) -> list[dict]:
 
 
 # --- curves
-
-
-def test_intervals_of_curves_are_those_of_means():
-    values = np.random.default_rng(0).normal(size=(8, 5))
-    low, high = st.bootstrap_curves(values)
-    each = [st.bootstrap(column) for column in values.T]
-    np.testing.assert_allclose(low, [i.low for i in each])
-    np.testing.assert_allclose(high, [i.high for i in each])
-    values[3, 1] = np.nan
-    gaps = np.isnan(st.bootstrap_curves(values))
-    assert gaps.tolist() == [[False, True, False, False, False]] * 2
-    assert np.isnan(st.bootstrap_curves(values[:1])).all()
 
 
 def test_an_environment_of_ones_own_is_drawn(own):
