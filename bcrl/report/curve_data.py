@@ -20,7 +20,7 @@ from bcrl.report.figures.curves import (
     shared_spans,
     spread_rows,
 )
-from bcrl.report.statistics import bootstrap_curves, mean
+from bcrl.report.statistics import bootstrap_curves
 from bcrl.report.variants import Runs, Variant
 from bcrl.results.layout import INDEX
 
@@ -78,7 +78,7 @@ def _series(variant: Variant, metrics: list[str]) -> dict[str, Any]:
         q1, median, q3 = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
         lines = {"low": low, "high": high, "median": median, "q1": q1, "q3": q3}
         curves[metric] = {name: _numbers(line) for name, line in lines.items()}
-        curves[metric]["mean"] = _numbers(mean(values), 7)
+        curves[metric]["mean"] = _numbers(values.mean(axis=0), 7)
         curves[metric]["seeds"] = [_numbers(seed) for seed in values[:SEEDS]]
         curves[metric]["far"] = metric in far
     return {

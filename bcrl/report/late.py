@@ -42,10 +42,7 @@ def pretraining_rows(variant: Variant) -> NDArray[np.intp]:
 
 def first_learner(variant: Variant) -> str:
     """`lspi` or `dqn`, whichever trains the first stage (recorded in the JSON)."""
-    learners = variant.sidecars[0].get("learners")
-    if learners:
-        return str(learners[0])
-    return "dqn" if variant.method in ("DQN", "C-DQN") else "lspi"
+    return str(variant.sidecars[0]["learners"][0])
 
 
 def pretraining(methods: Methods) -> dict[str, Variant]:

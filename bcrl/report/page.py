@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from bcrl import __version__
-from bcrl.report.claims.document import PREAMBLE, claims_sections, notes_of
+from bcrl.report.claims.document import GLOSSARY, PREAMBLE, claims_sections, notes_of
 from bcrl.report.curve_data import curve_data
 from bcrl.report.notes import incomplete
 from bcrl.report.origins import configurations, costs, provenance
@@ -89,6 +89,7 @@ def page(
         provenance=provenance(runs),
         notes=[note.text for note in notes],
         preamble=PREAMBLE,
+        glossary=GLOSSARY,
         curves=[curve_data(runs, env, family, tag) for env, family in runs.pairs],
     )
 

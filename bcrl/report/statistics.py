@@ -26,11 +26,6 @@ class Interval(NamedTuple):
 NONE = Interval(math.nan, math.nan)
 
 
-def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean over seeds, the leading axis: (S, …) → (…)."""
-    return np.mean(values, axis=0)
-
-
 def standard_error(values: NDArray[np.float64], ddof: int = 0) -> NDArray[np.float64]:
     """Standard error of the mean over seeds: (S, …) → (…), nan if S ≤ ddof.
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bcrl.report.statistics import Interval, bootstrap, mean, standard_error
+from bcrl.report.statistics import Interval, bootstrap, standard_error
 from bcrl.report.variants import Methods, Runs, Variant
 from bcrl.results.layout import INDEX
 
@@ -98,7 +98,7 @@ def aggregate(runs: Runs, family: str = "FQI") -> pd.DataFrame:
                 counter: variant.index,
                 "metric": metric,
                 "seeds": len(variant.seeds),
-                "mean": mean(values),
+                "mean": values.mean(axis=0),
                 "standard_error": standard_error(values, ddof=1),
             }
         )

@@ -7,7 +7,7 @@ import sys
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from bcrl import __version__
 from bcrl.errors import BcrlError, closest
@@ -25,8 +25,8 @@ class Parser(argparse.ArgumentParser):
         super().__init__(prog=prog, description=description)
         self.add_argument("--version", action="version", version=f"bcrl {__version__}")
         text = "the results, also runs_dir=PATH as bcrl has it; default: %(default)s"
-        kind: dict[str, Any] = {"type": Path, "default": Path("runs"), "metavar": "PATH"}
-        self.add_argument("--runs-dir", help=text, **kind)
+        add, runs = self.add_argument, Path("runs")
+        add("--runs-dir", type=Path, default=runs, metavar="PATH", help=text)
 
     def parsed(self, words: Sequence[str] | None = None) -> Namespace:
         """The options in `words` or on the command line; BcrlError for a bad one."""

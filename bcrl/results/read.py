@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shlex
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -98,16 +97,8 @@ def _has_the_schema(document: Document) -> bool:
 
 
 def command_of(document: Mapping[str, Any]) -> str:
-    """The command that made a seed, ready to paste; empty if it isn't recorded.
-
-    Records of older versions are not quoted: spaces separate their words.
-    """
-    recorded = str(document.get("command") or "")
-    try:
-        words = shlex.split(recorded)
-    except ValueError:  # an older record with a single quote
-        words = recorded.split(" ")
-    return shlex.join([Path(word).name for word in words[:1]] + words[1:])
+    """The command that made a seed, ready to paste; empty if it isn't recorded."""
+    return str(document.get("command") or "")
 
 
 def _bytes(path: Path) -> bytes:

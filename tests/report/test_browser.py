@@ -17,7 +17,7 @@ from PIL import Image, ImageColor
 
 from bcrl.report import cli
 from bcrl.report.figures import style
-from bcrl.results.layout import FQI_METRICS as METRICS
+from bcrl.results.layout import FQI_METRICS
 from tests.report.test_page import write_own
 from tests.report.test_report import write_runs
 
@@ -27,6 +27,7 @@ SWITCHES = (
     *("disable-background-networking", "disable-component-update", "disable-sync"),
 )
 WIDTH, HEIGHT = 1280, 900
+pytestmark = pytest.mark.browser
 
 
 def start_browser(profile: Path):
@@ -121,7 +122,7 @@ class Page:
 @pytest.fixture(scope="module")
 def runs_dir(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("runs")
-    for env in METRICS:
+    for env in FQI_METRICS:
         write_runs(root, env)
     write_own(root)
     assert cli.main(["--runs-dir", str(root), "--scale", "smoke"]) == 0

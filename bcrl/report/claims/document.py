@@ -42,6 +42,15 @@ contradicts it, and is *undecided* otherwise or with fewer than {FEWEST_SEEDS} s
 For claims that something never happens the count decides. Each claim is tested by
 itself, without a correction for their number.
 """
+GLOSSARY = """\
+*T1*, *T2*, …: the tasks of the curriculum, the target last. *s0*: the state in which
+episodes start. `Q*`, `V*`: values of an optimal policy; the *optimum* is `V*(s0)` of
+the target. *ϱ*: the residual, what a stage adds to the Q-function of the stage before.
+*C-*: with a curriculum; *B-*: boosted; *S-*: with shaped rewards; *RPL*: residual
+policy learning; *PPR*: probabilistic policy reuse. *LQ*: the linear-quadratic task
+that comes first in the linear system; *LSPI*: least-squares policy iteration. *IQM*:
+interquartile mean. *@released*: settings of the authors' released code.
+"""
 LATE = f"""\
 All returns are the target task's. *Late*: a seed's mean over the evaluations of its
 last {WINDOW} environment steps; *area*: its mean over all evaluations in the target.
@@ -56,7 +65,7 @@ def claims_report(runs: Runs, tag: str | None = None) -> str:
     parts = [f"# The paper's claims, scale {runs.scale}{tagged}\n"]
     if lacking := incomplete(notes):
         parts.append(f"**{lacking}**\n")
-    parts += [PREAMBLE, *map(str, claims_sections(runs, tag).values())]
+    parts += [PREAMBLE, GLOSSARY, *map(str, claims_sections(runs, tag).values())]
     if notes:
         parts.append("## Notes on the runs\n")
         parts.append("\n".join(f"- {note.text}" for note in notes) + "\n")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bcrl.common.divergence import diverging
 from bcrl.report.figures import style
-from bcrl.report.statistics import bootstrap_curves, mean, standard_error
+from bcrl.report.statistics import bootstrap_curves, standard_error
 from bcrl.report.variants import Methods, Runs, Variant
 
 POINTS = 300  # of a curve that are drawn, about
@@ -34,6 +34,7 @@ LABELS = {
     ("DQN", "greedy_success_rate"): "success rate, greedy",
     ("DQN", "q_mean"): "value at the start, max Q",
 }
+SEEDS = {"linewidth": 0.5, "linestyle": (0, (3, 2)), "alpha": 0.45, "zorder": 1.9}
 TWO_ERRORS = "mean ± 2 standard errors over seeds"
 Interval = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -51,7 +52,7 @@ def optimum_of(methods: Methods) -> float | None:
 
 def two_errors(values: NDArray[np.float64]) -> Interval:
     """Mean ± 2 standard errors of (S, P) values, (P,) each."""
-    centre, half = mean(values), 2 * standard_error(values)
+    centre, half = values.mean(axis=0), 2 * standard_error(values)
     return centre - half, centre + half
 
 
@@ -73,21 +74,30 @@ def draw_metric(
     methods: Methods,
     metric: str,
     rows: Callable[[Variant], NDArray[np.intp]] = every,
-    interval: Callable[[NDArray[np.float64]], Interval] = two_errors,
+    interval: Callable[[NDArray[np.float64]], Interval] | None = two_errors,
 ) -> None:
-    """Every method's mean over seeds with a band; diverging curves are cut off."""
+    """Every method's mean over seeds with a band, or with all seeds if no `interval`.
+
+    Diverging curves are cut off.
+    """
     far, within = [], []
     for name, variant in methods.items():
         if metric in variant.metrics:
             at, line = rows(variant), style.line_of(name)
             x, values = variant.index[at], variant.metrics[metric][:, at]
-            centre, (low, high) = mean(values), interval(values)
-            fill = {"color": line["color"], "alpha": 0.25, "linewidth": 0}
-            axes.fill_between(x, low, high, **fill)
-            axes.plot(x, centre, linewidth=1.6, **line)
+            drawn = [values]
+            if interval:
+                low, high = interval(values)
+                fill = {"color": line["color"], "alpha": 0.25, "linewidth": 0}
+                axes.fill_between(x, low, high, **fill)
+                drawn = [values.mean(axis=0), low, high]
+            else:
+                axes.plot(x, values.T, **SEEDS, color=line["color"])
+            width = 1.6 if interval else 2.0
+            axes.plot(x, values.mean(axis=0), linewidth=width, **line)
             diverges = metric in diverging(variant.metrics)
             far += [name] * diverges
-            within += [] if diverges else [centre, low, high]
+            within += [] if diverges else drawn
     style.cut(axes, far, within)
 
 
@@ -153,16 +163,7 @@ def figure_1(runs: Runs, tag: str | None = None) -> Figure:
     labels = [label("FQI", metric) for metric in metrics]
     figure, panels = _panels(methods, labels, (style.WIDTH, 3.3))
     for axes, metric in zip(panels, metrics, strict=True):
-        far, within = [], []
-        for name, variant in methods.items():
-            seeds = {"linewidth": 0.5, "linestyle": (0, (3, 2)), "alpha": 0.45}
-            values, colour = variant.metrics[metric], style.colour(name)
-            axes.plot(variant.index, values.T, color=colour, zorder=1.9, **seeds)
-            axes.plot(variant.index, mean(values), color=colour, linewidth=2.0)
-            diverges = metric in diverging(variant.metrics)
-            far += [name] * diverges
-            within += [] if diverges else [values]
-        style.cut(axes, far, within)
+        draw_metric(axes, methods, metric, interval=None)
     style.legend(figure, methods)
     style.footer(figure, runs, methods, "bold: mean over seeds, dashed: single seeds")
     return figure
