@@ -11,8 +11,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from bcrl import trust
-from bcrl.config import construct, one_of
+from bcrl.common import plugins
+from bcrl.common.checks import construct, one_of
 from bcrl.errors import ConfigError
 
 #: Takes the name of the column that counts, and each seed's new rows.
@@ -99,7 +99,7 @@ def logger(section: Any) -> Logger:
     values = {key: value for key, value in section.items() if key != "name"}
     name = section["name"]
     if "." in name:
-        return construct("logger", trust.component("logger.name", name, name), values)
+        return construct("logger", plugins.component("logger.name", name, name), values)
     one_of("logger.name", name, list(LOGGERS))
     return construct("logger", LOGGERS[name], values)
 
