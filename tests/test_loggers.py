@@ -10,10 +10,10 @@ import pandas as pd
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from bcrl import loggers
 from bcrl.common.signals import Interrupted
 from bcrl.errors import ConfigError
 from bcrl.report.integrity import check_tree
+from bcrl.results import loggers
 from bcrl.run import runner
 from tests.conftest import plan
 

@@ -18,6 +18,7 @@ MOVED = {
     "bcrl.drawing": "bcrl.envs.rendering",
     "bcrl.gym": "bcrl.envs.gym_api",
     "bcrl.learners": "bcrl.learning",
+    "bcrl.loggers": "bcrl.results.loggers",
     "bcrl.oracle": "bcrl.evaluation.oracle",
     "bcrl.pack": "bcrl.common.serialization",
     "bcrl.policies": "bcrl.learning.policies",

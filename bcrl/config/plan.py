@@ -25,7 +25,7 @@ from bcrl.errors import ConfigError, at_least, did_you_mean
 from bcrl.evaluation import metrics as probes
 from bcrl.learning.stage import Stage
 from bcrl.learning.transfer import PolicyReuse, ResidualPolicy, Shape
-from bcrl.loggers import logger
+from bcrl.results.loggers import logger
 
 
 @dataclass(frozen=True)

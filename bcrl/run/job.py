@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from bcrl import loggers
 from bcrl.common.signals import Stop
 from bcrl.common.terminal import say
 from bcrl.config.plan import Plan
@@ -24,7 +23,8 @@ from bcrl.evaluation.metrics import Probe
 from bcrl.evaluation.step_metrics import StepProbe
 from bcrl.learning.rollout import success_of
 from bcrl.learning.stage import CurriculumRun, SeedBatch, Snapshot
-from bcrl.loggers import Log
+from bcrl.results import loggers
+from bcrl.results.loggers import Log
 from bcrl.run import checkpoints, records
 from bcrl.run.locks import Lock, claimed
 from bcrl.run.progress import Tick, named
