@@ -9,13 +9,12 @@ from __future__ import annotations
 import re
 import textwrap
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import yaml
 
 from bcrl.common.identity import flat
-from bcrl.config.hydra_compose import CONF, Folders
+from bcrl.config.hydra_compose import CONF
 from bcrl.errors import BcrlError
 
 #: The groups whose options bring keys.
@@ -56,10 +55,10 @@ class Entry:
         return "; ".join(f"{value} ({', '.join(of)})" for value, of in options.items())
 
 
-def entries(folders: Folders = ()) -> list[Entry]:
+def entries() -> list[Entry]:
     """All keys that a user can set, by group."""
-    found = [e for group in ("", *GROUPS) for e in _of_group(group, folders)]
-    for path in _files("budget", folders):
+    found = [e for group in ("", *GROUPS) for e in _of_group(group)]
+    for path in sorted(CONF.glob("budget/*.yaml")):
         env, _, algorithm = path.stem.rpartition("_")
         values = yaml.safe_load(path.read_text("utf-8"))
         for entry in (e for e in found if e.group == "algorithm"):
@@ -69,34 +68,34 @@ def entries(folders: Folders = ()) -> list[Entry]:
     return found
 
 
-def options(group: str, folders: Folders = ()) -> dict[str, str]:
+def options(group: str) -> dict[str, str]:
     """The options of a group, each with the comment that its file begins with."""
     found = {}
-    for path in _files(group, folders):
+    for path in sorted(CONF.glob(f"{group}/*.yaml")):
         top = re.match(r"(?:#.*\n)*", path.read_text("utf-8"))[0]  # type: ignore
         lines = [x.lstrip("# ") for x in top.splitlines() if "@package" not in x]
         found[path.stem] = " ".join(lines)
     return found
 
 
-def describe(word: str, folders: Folders = ()) -> str:
-    """The description of a key or a group; a list of all keys for an empty word.
+def describe(word: str) -> str:
+    """What a key does, or a list: a group's options, the keys below, all keys for "".
 
     Raises BcrlError for an unknown key.
     """
-    key, known = word.partition("=")[0], entries(folders)
-    if not key:
-        first = {entry.key: entry.parts[0].partition(". ")[0] for entry in known}
-        return "\n".join(f"{key}: {text}" for key, text in first.items())
-    if key in (*GROUPS, *SHORTHANDS):
-        lines = [f"{key}={option}: {x}" for option, x in options(key, folders).items()]
-        keys = dict.fromkeys(entry.key for entry in known if entry.group == key)
-        return "\n".join(lines + [f"keys: {', '.join(keys)}"] * bool(keys))
+    key, known = word.partition("=")[0], entries()
     if chosen := [entry for entry in known if entry.key == key]:
         return "\n".join([key, *(_block(entry, len(chosen) > 1) for entry in chosen)])
+    prefix = f"{key.replace('/', '.')}." if key else ""
+    listed = options(key) if key in (*GROUPS, *SHORTHANDS) else {}
+    listed = {f"{key}={option}": text for option, text in listed.items()}
+    for entry in (e for e in known if e.key.startswith(prefix)):
+        listed.setdefault(entry.key, entry.parts[0].partition(". ")[0])
+    if listed:
+        return "\n".join(f"{name}: {text.rstrip('.')}" for name, text in listed.items())
     from bcrl.config.hints import Hints  # composes a config, which takes a while
 
-    line = Hints((), folders).words(key, "") or ""
+    line = Hints(()).words(key, "") or ""
     near = line.split(" ")[-1].partition("=")[0]
     hint = f"did you mean {near}?" if near else "bcrl --describe lists all keys"
     raise BcrlError(f"--describe {key}: unknown key; {hint}")
@@ -107,18 +106,14 @@ def _block(entry: Entry, several: bool) -> str:
     facts = [f"With {entry.group}={', '.join(entry.defaults)}:"] * several
     facts += [text, f"Default: {entry.default}."]
     facts += [f"Unit: {unit}."] * bool(unit) + [f"Allowed: {allowed}."] * bool(allowed)
-    indent = {"initial_indent": "  ", "subsequent_indent": "    "}
-    return "\n".join(textwrap.fill(fact, 88, **indent) for fact in facts)
+    wrapped = (textwrap.fill(f"  {x}", 88, subsequent_indent="    ") for x in facts)
+    return "\n".join(wrapped)
 
 
-def _files(group: str, folders: Folders) -> list[Path]:
-    return sorted(p for f in (CONF, *folders) for p in Path(f, group).glob("*.yaml"))
-
-
-def _of_group(group: str, folders: Folders) -> list[Entry]:
+def _of_group(group: str) -> list[Entry]:
     """A group's entries; a key without a comment joins the first entry of its name."""
     found: list[Entry] = []
-    files = _files(group, folders) if group else [CONF / "config.yaml"]
+    files = sorted(CONF.glob(f"{group}/*.yaml" if group else "config.yaml"))
     texts = {path.stem: path.read_text("utf-8") for path in files}
     prefix = f"{group.replace('/', '.')}." if group else ""
     for described in (True, False):
