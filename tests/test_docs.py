@@ -16,15 +16,18 @@ PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "bench/README.md")),
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
+#: Commands that compose many jobs, or try out simulators.
+SLOW = r"experiment=|env=gymnasium|env=mountain_car"
 #: Pages that are made when the site is built.
 GENERATED = (ROOT / "docs" / "reference" / "config.md",)
 
 
 def commands(page: Path) -> list[str]:
-    """The `bcrl` lines of a page's shell blocks, continued ones whole."""
+    """The `bcrl` lines of a page's shell blocks, whole and without comments."""
     blocks = re.findall(r"```sh\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
     lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
-    return [line for line in lines if re.match(r"bcrl [^…<$]*$", line)]
+    found = [line for line in lines if re.match(r"bcrl [^…<$]*$", line)]
+    return [shlex.join(shlex.split(line, comments=True)) for line in found]
 
 
 COMMANDS = dict.fromkeys(
@@ -32,10 +35,16 @@ COMMANDS = dict.fromkeys(
 )
 
 
-@pytest.mark.parametrize("line", COMMANDS)
+@pytest.mark.parametrize(
+    "line",
+    [
+        pytest.param(line, marks=pytest.mark.slow) if re.search(SLOW, line) else line
+        for line in COMMANDS
+    ],
+)
 def test_every_command_would_run(line, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = shlex.split(line, comments=True)[1:]
+    words = shlex.split(line)[1:]
     arguments = shell.parser().parse_intermixed_args(words)
     if not arguments.status:
         assert "nothing was run" in status.dry_run(vetting.plans(arguments))
@@ -61,7 +70,8 @@ def test_links_lead_somewhere(page):
 def test_named_files_exist(page):
     """Such as `bcrl/learning/stage.py`, `tests/run/` or `examples/own_env.py`."""
     for name in re.findall(
-        r"`((?:bcrl|tests|conf|examples|bench|docs)/[\w./-]*)`", page.read_text("utf-8")
+        r"`((?:bcrl|tests|conf|examples|bench|docs)/[\w./-]*(?:/|\.\w+))`",
+        page.read_text("utf-8"),
     ):
         assert (ROOT / name).exists(), name
 

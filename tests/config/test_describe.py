@@ -42,8 +42,12 @@ def test_every_key_of_the_other_groups_is_described():
     found = set()
     for name in REGRESSORS:
         found |= keys("env=maze", f"algorithm/regressor={name}")
-    for boosting, transfer in itertools.zip_longest(("off", "on", "released"), TRANSFERS):
-        found |= keys("env=maze", f"boosting={boosting or 'off'}", f"transfer={transfer}")
+    for boosting, transfer in itertools.zip_longest(
+        ("off", "on", "released"), TRANSFERS
+    ):
+        found |= keys(
+            "env=maze", f"boosting={boosting or 'off'}", f"transfer={transfer}"
+        )
     known = {entry.key for entry in ENTRIES if entry.parts[0]}
     assert {k for k in found if not k.startswith("hydra.")} <= known
     for option in LAUNCHERS:
