@@ -17,9 +17,9 @@ from bcrl.errors import BcrlError, did_you_mean
 from bcrl.report.variants import Runs, Variant
 from bcrl.results.read import bad_file
 
-COLOURS = 64  # of a GIF's palette
-PAUSE = 1500  # ms that the last frame stands
-RETURNS = ("greedy_return", "return")  # columns that say how good a policy is
+_COLOURS = 64  # of a GIF's palette
+_PAUSE = 1500  # ms that the last frame stands
+_RETURNS = ("greedy_return", "return")  # columns that say how good a policy is
 
 
 def animations(
@@ -70,7 +70,7 @@ def _merit(variant: Variant) -> tuple[bool, bool, float]:
 
 def _last_returns(variant: Variant) -> NDArray[np.float64]:
     """Each seed's return at the end, (S,); zeros if none was measured."""
-    measured = [variant.last(name) for name in RETURNS if name in variant.metrics]
+    measured = [variant.last(name) for name in _RETURNS if name in variant.metrics]
     return measured[0] if measured else np.zeros(len(variant.seeds))
 
 
@@ -101,7 +101,7 @@ def frames(variant: Variant, seed: int) -> Iterator[tuple[NDArray[np.uint8], int
         )
     duration = 1000 // frames_per_second(env)
     for t, picture in enumerate(pictures):
-        yield picture, PAUSE if t == len(actions) else duration
+        yield picture, _PAUSE if t == len(actions) else duration
 
 
 def _write(
@@ -110,7 +110,7 @@ def _write(
     """A GIF that repeats, all frames with the palette of a middle one."""
     images = [Image.fromarray(picture) for picture in pictures]
     middle = images[(len(images) - 1) // 2]
-    palette = middle.quantize(COLOURS, Image.Quantize.MAXCOVERAGE)
+    palette = middle.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE)
     plain = Image.Dither.NONE
     first, *others = (each.quantize(palette=palette, dither=plain) for each in images)
     options = {"duration": list(durations), "loop": 0, "append_images": others}

@@ -24,7 +24,7 @@ from bcrl.report.page import Picture, Pictures, page
 from bcrl.report.sweeps import groups, sweep_report
 from bcrl.report.tables import aggregate
 from bcrl.report.variants import COMPARED, Runs, env_title
-from bcrl.results.arguments import Parser
+from bcrl.results.arguments import ResultsParser
 
 CAR, MAZE, LQ = ("car_on_hill", "FQI"), ("maze", "FQI"), (LINEAR, "DQN")
 #: figure → its runs' environment and family, experiment, method it cannot do without
@@ -39,9 +39,9 @@ FIGURES: dict[str, tuple[tuple[str, str], str, str | None, Callable[..., Figure]
 CURVES = "curves"  # learning curves of what the paper has no figure of
 
 
-def parser() -> Parser:
+def parser() -> ResultsParser:
     """The command line; its help is the reference."""
-    result = Parser(
+    result = ResultsParser(
         prog="bcrl-report",
         description="Draw figures of finished runs, test the paper's claims, and show "
         "all of it on one HTML page.",
@@ -126,7 +126,7 @@ def _save(
     out: Path, name: str, title: str, draw: Callable[..., Figure], *of: object
 ) -> list[Path]:
     with style.sheet():
-        return style.save(draw(*of), out, name, title)
+        return style.save_figure(draw(*of), out, name, title)
 
 
 def _draw_curves(runs: Runs, out: Path, tag: str | None, files: list[Path]) -> Pictures:

@@ -24,29 +24,29 @@ from bcrl.report.statistics import bootstrap_curves
 from bcrl.report.variants import Runs, Variant
 from bcrl.results.layout import INDEX
 
-SEEDS = 20  # whose own lines can be shown, the first of a variant's
-FIRST_SHOWN = 8  # variants that are shown at first if none has the tag
+_SEEDS = 20  # whose own lines can be shown, the first of a variant's
+_FIRST_SHOWN = 8  # variants that are shown at first if none has the tag
 #: Metrics that are shown at first, if the family has many.
-SHOWN = {"DQN": ("return", "success_rate", "greedy_return")}
-DASHES = ("7 3", "2 3", "9 3 2 3", "5 2")  # one's own algorithms, then other tags
+_SHOWN = {"DQN": ("return", "success_rate", "greedy_return")}
+_DASHES = ("7 3", "2 3", "9 3 2 3", "5 2")  # one's own algorithms, then other tags
 
 
 def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, Any]:
     """All variants of an environment and family, those of the tag shown at first."""
     found = {v.name: v for v in runs.of(env, family)}
     main = (
-        runs.compared(env, tag, family).values() or list(found.values())[:FIRST_SHOWN]
+        runs.compared(env, tag, family).values() or list(found.values())[:_FIRST_SHOWN]
     )
     ours = {variant.name: variant for variant in main}
     first, *_ = tags = list(dict.fromkeys(variant.tag for variant in main))
-    dashes = {name: DASHES[0] for name, v in ours.items() if style.dashed(v.method)}
+    dashes = {name: _DASHES[0] for name, v in ours.items() if style.dashed(v.method)}
     dashes |= {  # beside the first tag, the others need another look
-        name: DASHES[(tags.index(v.tag) - 1) % len(DASHES)]
+        name: _DASHES[(tags.index(v.tag) - 1) % len(_DASHES)]
         for name, v in ours.items()
         if v.tag != first
     }
     others = [name for name in found if name not in ours]
-    dashes |= dict(zip(others, itertools.cycle(DASHES[1:]), strict=False))
+    dashes |= dict(zip(others, itertools.cycle(_DASHES[1:]), strict=False))
     metrics = metrics_of(found)
     return {
         "id": f"{env}-{family}",
@@ -59,7 +59,7 @@ def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, 
         "target": family == "DQN",
         "metrics": metrics,
         "labels": {metric: label(family, metric) for metric in metrics},
-        "shown": [m for m in metrics if m in SHOWN.get(family, metrics)] or metrics,
+        "shown": [m for m in metrics if m in _SHOWN.get(family, metrics)] or metrics,
         "series": [
             {"on": name in ours, "dash": dashes.get(name, "")}
             | _series(variant, [m for m in metrics if m in variant.metrics])
@@ -79,7 +79,7 @@ def _series(variant: Variant, metrics: list[str]) -> dict[str, Any]:
         lines = {"low": low, "high": high, "median": median, "q1": q1, "q3": q3}
         curves[metric] = {name: _numbers(line) for name, line in lines.items()}
         curves[metric]["mean"] = _numbers(values.mean(axis=0), 7)
-        curves[metric]["seeds"] = [_numbers(seed) for seed in values[:SEEDS]]
+        curves[metric]["seeds"] = [_numbers(seed) for seed in values[:_SEEDS]]
         curves[metric]["far"] = metric in far
     return {
         "name": variant.name,

@@ -11,7 +11,7 @@ LINEAR = "linear_system"
 WINDOW = 5000  # environment steps before a run's end whose evaluations are averaged
 
 #: A learner's name in the records → in the figures.
-LEARNERS = {"lspi": "LSPI", "dqn": "DQN on LQ"}
+LEARNER_NAMES = {"lspi": "LSPI", "dqn": "DQN on LQ"}
 
 
 def target_rows(variant: Variant) -> NDArray[np.intp]:
@@ -54,7 +54,7 @@ def pretraining(methods: Methods) -> dict[str, Variant]:
     for variant in sorted(methods.values(), key=lambda v: -len(v.seeds)):
         if len(pretraining_rows(variant)):
             found.setdefault(first_learner(variant), variant)
-    return {learner: found[learner] for learner in LEARNERS if learner in found}
+    return {learner: found[learner] for learner in LEARNER_NAMES if learner in found}
 
 
 def switches(methods: Methods) -> dict[tuple[str, int], str]:
@@ -64,6 +64,6 @@ def switches(methods: Methods) -> dict[tuple[str, int], str]:
         rows = pretraining_rows(variant)
         if len(rows):
             learner = first_learner(variant)
-            label = f"{LEARNERS.get(learner, learner)} → target"
+            label = f"{LEARNER_NAMES.get(learner, learner)} → target"
             found[learner, int(variant.index[rows[-1]])] = label
     return found

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from bcrl.common.identity import differences, flat, identity
-from bcrl.report.tables import ABSENT, Table, duration, number
+from bcrl.report.tables import ABSENT, TextTable, duration, number
 from bcrl.report.variants import Runs, Variant, env_title
 from bcrl.results.layout import seed_path, spelled
 from bcrl.results.read import command_of
 
 
-def costs(runs: Runs) -> list[str | Table]:
+def costs(runs: Runs) -> list[str | TextTable]:
     """CPU time and memory of each variant, and of all of an environment's."""
     rows = []
     for env, family in runs.pairs:
@@ -32,7 +32,7 @@ def costs(runs: Runs) -> list[str | Table]:
         "of a process, which may have trained others before."
     )
     header = ("variant", "seeds", "CPU s per seed", "CPU time", "peak memory, MiB")
-    return [text, Table(header, rows)]
+    return [text, TextTable(header, rows)]
 
 
 def configurations(runs: Runs) -> list[dict[str, Any]]:
@@ -66,7 +66,7 @@ def _text(value: object) -> str:
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
-def provenance(runs: Runs) -> list[str | Table]:
+def seed_origins(runs: Runs) -> list[str | TextTable]:
     """Which code, libraries and machine made which seeds, and when."""
     made: dict[tuple[str, ...], dict[Path, list[int]]] = {}
     rows = []
@@ -79,7 +79,7 @@ def provenance(runs: Runs) -> list[str | Table]:
         when = [_written(folder, seed) for folder, s in group.items() for seed in s]
         rows.append([", ".join(who), *origin, f"{min(when)} – {max(when)} UTC"])
     header = ("seeds", "revision", "versions", "machine", "finished (files' dates)")
-    return [Table(header, rows)]
+    return [TextTable(header, rows)]
 
 
 def _origin(sidecar: dict[str, Any]) -> tuple[str, ...]:

@@ -17,13 +17,12 @@ from bcrl import __version__
 from bcrl.report.claims.document import GLOSSARY, PREAMBLE, claims_sections, notes_of
 from bcrl.report.curve_data import curve_data
 from bcrl.report.notes import incomplete
-from bcrl.report.origins import configurations, costs, provenance
-from bcrl.report.sweeps import PREAMBLE as SWEEPS
-from bcrl.report.sweeps import groups, sweep_sections
-from bcrl.report.tables import Section, Table, duration
+from bcrl.report.origins import configurations, costs, seed_origins
+from bcrl.report.sweeps import SWEEPS_PREAMBLE, groups, sweep_sections
+from bcrl.report.tables import Section, TextTable, duration
 from bcrl.report.variants import Runs, env_title
 
-KINDS = {".png": "image/png", ".gif": "image/gif"}
+_KINDS = {".png": "image/png", ".gif": "image/gif"}
 Pair = tuple[str, str]  # environment and family
 
 
@@ -37,7 +36,7 @@ class Picture(NamedTuple):
     def source(self) -> str:
         """The whole file as a URL."""
         data = base64.b64encode(self.path.read_bytes()).decode()
-        return f"data:{KINDS[self.path.suffix]};base64,{data}"
+        return f"data:{_KINDS[self.path.suffix]};base64,{data}"
 
 
 Pictures = dict[Pair, list[Picture]]
@@ -83,10 +82,10 @@ def page(
         sections=sections,
         agents=agents,
         sweeps=list(sweep_sections(compared)) if compared else [],
-        sweeps_preamble=SWEEPS,
+        sweeps_preamble=SWEEPS_PREAMBLE,
         costs=costs(runs),
         configs=configurations(runs),
-        provenance=provenance(runs),
+        provenance=seed_origins(runs),
         notes=[note.text for note in notes],
         preamble=PREAMBLE,
         glossary=GLOSSARY,
@@ -97,7 +96,9 @@ def page(
 def _facts(runs: Runs, claims: Mapping[Pair, Section]) -> list[tuple[str, str]]:
     """What the page's head says in numbers."""
     parts = [part for section in claims.values() for part in section.parts]
-    tables = [p for p in parts if isinstance(p, Table) and p.header[-1] == "verdict"]
+    tables = [
+        p for p in parts if isinstance(p, TextTable) and p.header[-1] == "verdict"
+    ]
     kinds = Counter(_verdict(row[-1]) for table in tables for row in table.rows)
     facts = {
         "environments": len({env for env, _ in runs.pairs}),

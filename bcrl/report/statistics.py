@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-RESAMPLES = 10_000
+_RESAMPLES = 10_000
 LEVEL = 0.95
-BLOCK = 4_000_000  # resampled seeds that are held in memory at a time
-SEED = 20_220_425  # every interval draws from its own generator, started from this
+MOST_DRAWS = 4_000_000  # resampled seeds that are held in memory at a time
+_SEED = 20_220_425  # every interval draws from its own generator, started from this
 
 
 class Interval(NamedTuple):
@@ -64,12 +64,12 @@ def bootstrap(
     found = stats.bootstrap(
         samples,
         of,
-        n_resamples=RESAMPLES,
-        batch=max(1, BLOCK // max(map(len, samples))),
+        n_resamples=_RESAMPLES,
+        batch=max(1, MOST_DRAWS // max(map(len, samples))),
         vectorized=True,
         confidence_level=LEVEL,
         method="percentile",
-        rng=np.random.default_rng(SEED),
+        rng=np.random.default_rng(_SEED),
     )
     return Interval(*map(float, found.confidence_interval))
 
@@ -84,9 +84,9 @@ def bootstrap_curves(
     n = len(values)
     if n < 2:
         return np.full((2, values.shape[1]), math.nan)
-    rng, means, most = np.random.default_rng(SEED), [], max(1, BLOCK // n)
-    for begun in range(0, RESAMPLES, most):
-        rows = rng.integers(n, size=(min(most, RESAMPLES - begun), n))
+    rng, means, most = np.random.default_rng(_SEED), [], max(1, MOST_DRAWS // n)
+    for begun in range(0, _RESAMPLES, most):
+        rows = rng.integers(n, size=(min(most, _RESAMPLES - begun), n))
         places = rows + n * np.arange(len(rows))[:, None]
         counts = np.bincount(places.ravel(), minlength=rows.size).reshape(-1, n)
         means.append(counts @ values / n)

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from bcrl.common.identity import OUTPUT_KEYS, flat
 from bcrl.report.late import WINDOW, late
-from bcrl.report.tables import ABSENT, Section, Table, mean_cell, seeds_cell
+from bcrl.report.tables import ABSENT, Section, TextTable, mean_cell, seeds_cell
 from bcrl.report.variants import Runs, Variant
 from bcrl.results.layout import spelled
 
 #: The return that ranks variants, by family.
-DECISIVE = {"FQI": "last return", "DQN": "late return"}
-IGNORED = (*OUTPUT_KEYS, "scale")  # top-level keys of a config that all may differ in
+_DECISIVE = {"FQI": "last return", "DQN": "late return"}
+_IGNORED = (*OUTPUT_KEYS, "scale")  # top-level keys of a config that all may differ in
 
-PREAMBLE = f"""\
+SWEEPS_PREAMBLE = f"""\
 Variants of one method that differ in their configuration, compared over the seeds
 named in their rows. *Late*: a seed's mean over the evaluations of its last {WINDOW}
 environment steps; *last*: the last evaluation or iteration. Brackets are 95 %
@@ -47,7 +47,7 @@ class Group:
         """The variant with the largest mean return, None if all are non-finite."""
         ranked = {}
         for variant in self.variants:
-            values = measured(variant)[DECISIVE[variant.family]]
+            values = measured(variant)[_DECISIVE[variant.family]]
             if values is not None and np.isfinite(values.mean()):
                 ranked[variant.name] = values.mean()
         best = max(ranked, key=lambda name: ranked[name], default=None)
@@ -86,7 +86,7 @@ def groups(runs: Runs) -> list[Group]:
 def _texts(variant: Variant) -> dict[str, str]:
     """Dotted keys of a variant's config → values as JSON, strings without quotes."""
     config = variant.sidecars[0].get("config") or {}
-    kept = flat({k: v for k, v in config.items() if k not in IGNORED})
+    kept = flat({k: v for k, v in config.items() if k not in _IGNORED})
     return {k: json.dumps(v, ensure_ascii=False).strip('"') for k, v in kept.items()}
 
 
@@ -107,7 +107,7 @@ def sweep_sections(found: list[Group]) -> Iterator[Section]:
             "seeds · number",
             *measured(group.variants[0]),
         ]
-        table = Table(header, rows)
+        table = TextTable(header, rows)
         yield Section(f"{group.env}: {group.method}", [f"{text}\n", table])
 
 
@@ -115,13 +115,13 @@ def _row(group: Group, variant: Variant) -> list[str]:
     seeds = f"{spelled(variant.seeds)} · {seeds_cell(variant)}"
     cells = {name: mean_cell(values) for name, values in measured(variant).items()}
     if variant is group.best:
-        cells[DECISIVE[variant.family]] = f"**{cells[DECISIVE[variant.family]]}**"
+        cells[_DECISIVE[variant.family]] = f"**{cells[_DECISIVE[variant.family]]}**"
     return [variant.name, *group.settings[variant.name], seeds, *cells.values()]
 
 
 def sweep_report(runs: Runs, found: list[Group]) -> str:
     """The Markdown document of all groups, and the notes on their runs."""
-    parts = [f"# Variants compared, scale {runs.scale}\n", PREAMBLE]
+    parts = [f"# Variants compared, scale {runs.scale}\n", SWEEPS_PREAMBLE]
     parts += map(str, sweep_sections(found))
     ours = {(group.env, group.method) for group in found}
     odd = [n.text for n in runs.notes if (n.env, n.method) in ours]

@@ -16,7 +16,7 @@ from bcrl.results.layout import INDEX
 ABSENT = "–"  # a cell without a value
 
 
-class Table(NamedTuple):
+class TextTable(NamedTuple):
     """Cells of text; as a string it is Markdown, with bars inside cells escaped."""
 
     header: Sequence[str]
@@ -34,7 +34,7 @@ class Section(NamedTuple):
     """Paragraphs and tables below a title; as a string it is Markdown."""
 
     title: str
-    parts: Sequence[str | Table]
+    parts: Sequence[str | TextTable]
 
     def __str__(self) -> str:
         return "\n".join([f"## {self.title}\n", *map(str, self.parts)])
@@ -42,10 +42,10 @@ class Section(NamedTuple):
 
 def by_method(
     methods: Methods, columns: Mapping[str, Callable[[Variant], str]]
-) -> Table:
+) -> TextTable:
     """One row per method: its variant's name, then the cell of every column."""
     rows = [[v.name, *(cell(v) for cell in columns.values())] for v in methods.values()]
-    return Table(["method", *columns], rows)
+    return TextTable(["method", *columns], rows)
 
 
 def number(value: float) -> str:

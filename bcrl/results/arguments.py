@@ -13,12 +13,17 @@ from bcrl import __version__
 from bcrl.errors import BcrlError, closest
 
 #: Words that people type → the flag that they mean.
-HABITS = {"help": "--help", "version": "--version", "v": "--version", "output": "--out"}
-HABITS |= {"out_dir": "--out", "results": "--runs-dir", "dir": "--runs-dir"}
-SCALES = ("smoke", "quick", "paper", "search")
+_HABITS = {
+    "help": "--help",
+    "version": "--version",
+    "v": "--version",
+    "output": "--out",
+}
+_HABITS |= {"out_dir": "--out", "results": "--runs-dir", "dir": "--runs-dir"}
+_SCALES = ("smoke", "quick", "paper", "search")
 
 
-class Parser(argparse.ArgumentParser):
+class ResultsParser(argparse.ArgumentParser):
     """A parser that raises a BcrlError, with the words to type, for bad arguments."""
 
     def __init__(self, prog: str, description: str) -> None:
@@ -57,8 +62,8 @@ class Parser(argparse.ArgumentParser):
         key, _, value = word.lstrip("+-").partition("=")
         value, name = value or after, key.lower().replace("-", "_").rstrip(":")
         flags = self._flags()
-        flag = HABITS.get(name) or closest(f"--{name.replace('_', '-')}", flags, 0.6)
-        if "--scale" in flags and (scale := closest(word, SCALES, 0.8)):
+        flag = _HABITS.get(name) or closest(f"--{name.replace('_', '-')}", flags, 0.6)
+        if "--scale" in flags and (scale := closest(word, _SCALES, 0.8)):
             flag, value = "--scale", scale
         elif Path(word).is_dir() and not word.startswith("-"):
             flag, value = "--runs-dir", word

@@ -19,7 +19,7 @@ SUFFIXES = ("json", "csv", "npz")
 SEED, CHECKPOINT = "seed_", "checkpoint_"  # what names of files begin with
 LOGS = ".tensorboard"  # in runs_dir; hidden, because it holds no results
 
-#: What a seed's JSON begins its `status` with; `failed` is followed by the reason.
+#: The statuses in a seed's JSON; `failed` is followed by a colon and the reason.
 COMPLETE, RUNNING, FAILED = "complete", "running", "failed"
 
 #: The first columns of a family's CSVs: 1-based stage and task, then the counter of the
@@ -52,7 +52,7 @@ def seed_name(seed: int) -> str:
     return f"{SEED}{seed:04d}"
 
 
-def seeds_of(folder: Path, suffix: str) -> list[int]:
+def recorded_seeds(folder: Path, suffix: str) -> list[int]:
     """The seeds that a folder has files of, in order; other files are passed over."""
     stems = (path.stem.removeprefix(SEED) for path in folder.glob(f"{SEED}*"))
     seeds = sorted({int(stem) for stem in stems if stem.isdecimal()})

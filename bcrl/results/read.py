@@ -188,7 +188,7 @@ def read_folder(folder: str | Path) -> pd.DataFrame:
 
     BcrlError if there are none.
     """
-    numbers = layout.seeds_of(Path(folder), "csv")
+    numbers = layout.recorded_seeds(Path(folder), "csv")
     if not numbers:
         raise BcrlError(f"{folder}: there is no seed_*.csv")
     found = {n: pd.read_csv(layout.seed_path(Path(folder), n, "csv")) for n in numbers}

@@ -9,14 +9,14 @@ from pathlib import Path
 
 from bcrl.common.terminal import ready, say, show
 from bcrl.errors import BcrlError
-from bcrl.results.arguments import Parser
+from bcrl.results.arguments import ResultsParser
 from bcrl.results.integrity import check_tree
 from bcrl.results.read import BROKEN
 
 
-def parser() -> Parser:
+def parser() -> ResultsParser:
     """The command line; its help is the reference."""
-    result = Parser(
+    result = ResultsParser(
         prog="bcrl-verify",
         description="Check every result file of a folder: hashes, places, configs, "
         "order, missing seeds. Exit code: 0 nothing wrong, 1 some runs are incomplete, "

@@ -14,7 +14,14 @@ from typing import Any
 from bcrl.config import vetting
 from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
-from bcrl.results.layout import COMPLETE, CONFIG, FAILED, RUNNING, seeds_of, spelled
+from bcrl.results.layout import (
+    COMPLETE,
+    CONFIG,
+    FAILED,
+    RUNNING,
+    recorded_seeds,
+    spelled,
+)
 from bcrl.run import checkpoints, costs, locks, records, runner
 from bcrl.run.progress import named
 
@@ -104,7 +111,7 @@ def status(arguments: Namespace) -> str:
 def _ever_asked(directory: Path) -> list[int]:
     """The seeds that a variant's folder was ever asked for, by what those begun say."""
     seeds: set[int] = set()
-    for number in seeds_of(directory, "json"):
+    for number in recorded_seeds(directory, "json"):
         try:
             for first, last in records.read_facts(directory, number)["asked"]:
                 seeds.update(range(first, min(last, first + MOST) + 1))

@@ -112,7 +112,7 @@ class Page:
         return found
 
     def requests(self) -> list[str]:
-        """The URLs asked for since the last call, but for data inside the page."""
+        """The URLs requested since the last call, but for data inside the page."""
         events = self.events()
         urls = [e["request"]["url"] for e in events["Network.requestWillBeSent"]]
         urls += [e["url"] for e in events["Network.webSocketCreated"]]

@@ -194,7 +194,7 @@ def test_intervals_of_curves_are_those_of_means(monkeypatch):
     each = [st.bootstrap(column) for column in values.T]
     np.testing.assert_allclose(low, [i.low for i in each])
     np.testing.assert_allclose(high, [i.high for i in each])
-    monkeypatch.setattr(st, "BLOCK", 8 * 777)  # blocks change no draw
+    monkeypatch.setattr(st, "MOST_DRAWS", 8 * 777)  # blocks change no draw
     np.testing.assert_array_equal(st.bootstrap_curves(values), (low, high))
     values[3, 1] = np.nan
     gaps = np.isnan(st.bootstrap_curves(values))

@@ -144,8 +144,8 @@ def test_bad_input_is_rejected(section, key, value):
     assert (rejected.value.key, rejected.value.value) == (key, value)
 
 
-def test_a_logger_of_ones_own(tmp_path, monkeypatch):
-    """One module and one YAML, with a setting of its own."""
+def test_a_users_logger(tmp_path, monkeypatch):
+    """One module and one YAML, which has a setting."""
     (tmp_path / "my_loggers.py").write_text(MODULE)
     (tmp_path / "conf/logger").mkdir(parents=True)
     text = f"name: my_loggers.Lines\nfile: {tmp_path}/out\n"

@@ -80,7 +80,7 @@ def test_seeds_may_be_equal_and_environments_record_anything(tmp_path, verified)
 
 
 # --- what is broken: file, how it is spoilt (its new content, or entries of its JSON
-# that are changed as if the run had left them so), what is said of it
+# that are changed as if the run had left them so), a part of the message
 
 BROKEN = [
     ("seed_0001.json", '{"status": "compl', "JSON"),

@@ -20,7 +20,7 @@ from bcrl.report import statistics
 from bcrl.report.figures import style
 from bcrl.report.figures.curves import figure_curves
 from bcrl.report.load import load_runs
-from bcrl.results.layout import seeds_of
+from bcrl.results.layout import recorded_seeds
 from bcrl.run import launchers, progress, records, runner
 from bcrl.run import status as overview
 from bcrl.run.workers import cores
@@ -297,7 +297,7 @@ def test_a_rerun_makes_a_changed_seed_again_and_says_so(tmp_path, capsys):
 def test_seeds_are_in_the_order_of_their_numbers(tmp_path):
     p = made(tmp_path, range(9998, 10002))
     (p.directory / "seed_mine.csv").write_text("a\n1\n")
-    assert seeds_of(p.directory, "csv") == [9998, 9999, 10000, 10001]
+    assert recorded_seeds(p.directory, "csv") == [9998, 9999, 10000, 10001]
     frame = api.read(p.directory)
     assert list(dict.fromkeys(frame["seed"])) == [9998, 9999, 10000, 10001]
 
@@ -305,7 +305,7 @@ def test_seeds_are_in_the_order_of_their_numbers(tmp_path):
 def test_intervals_do_not_depend_on_blocks(monkeypatch):
     values = np.random.default_rng(0).normal(size=(30, 4))
     whole = statistics.bootstrap_curves(values), statistics.bootstrap(values[:, 0])
-    monkeypatch.setattr(statistics, "BLOCK", 30 * 777)
+    monkeypatch.setattr(statistics, "MOST_DRAWS", 30 * 777)
     blocks = statistics.bootstrap_curves(values), statistics.bootstrap(values[:, 0])
     assert np.allclose(whole[0], blocks[0], rtol=1e-13) and whole[1] == blocks[1]
 

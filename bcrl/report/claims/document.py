@@ -15,7 +15,7 @@ from bcrl.report.statistics import interquartile_mean, share_interval
 from bcrl.report.tables import (
     ABSENT,
     Section,
-    Table,
+    TextTable,
     by_method,
     duration,
     mean_cell,
@@ -51,7 +51,7 @@ policy learning; *PPR*: probabilistic policy reuse. *LQ*: the linear-quadratic t
 that comes first in the linear system; *LSPI*: least-squares policy iteration. *IQM*:
 interquartile mean. *@released*: settings of the authors' released code.
 """
-LATE = f"""\
+_LATE = f"""\
 All returns are the target task's. *Late*: a seed's mean over the evaluations of its
 last {WINDOW} environment steps; *area*: its mean over all evaluations in the target.
 Both are of the exploring policy and undiscounted, unless a column says otherwise.
@@ -84,11 +84,11 @@ def claims_sections(runs: Runs, tag: str | None) -> dict[tuple[str, str], Sectio
     found = {}
     for (env, family), (title, claims) in SECTIONS.items():
         methods = runs.methods(env, tag, family)
-        parts: list[str | Table] = []
+        parts: list[str | TextTable] = []
         if len({variant.tag for variant in methods.values()}) > 1:
             parts.append(f"{tags_shown(methods)}; the others are untagged.\n")
         rows = [claim.row(methods) for claim in claims]
-        parts += [_tally([row[-1] for row in rows]), Table(HEADER, rows)]
+        parts += [_tally([row[-1] for row in rows]), TextTable(HEADER, rows)]
         parts += _fqi_values(methods) if family == "FQI" else _dqn_values(methods)
         seconds = sum(variant.cpu_seconds for variant in methods.values())
         parts.append(f"CPU time of these runs: {duration(seconds)}.\n")
@@ -103,7 +103,7 @@ def _tally(verdicts: list[str]) -> str:
     return f"{len(verdicts)} claims: {counted}.\n"
 
 
-def _fqi_values(methods: Methods) -> list[str | Table]:
+def _fqi_values(methods: Methods) -> list[str | TextTable]:
     """Every metric after the last iteration and at every stage's end."""
     if not methods:
         return []
@@ -119,7 +119,7 @@ def _fqi_values(methods: Methods) -> list[str | Table]:
             "Share of seeds solving the trained task": "solved",
             "Mean residual at s0, averaged over actions,": "residual_start",
         }
-    parts: list[str | Table] = [
+    parts: list[str | TextTable] = [
         "After the last iteration (IQM: interquartile mean over seeds):\n",
         by_method(methods, columns),
     ]
@@ -148,7 +148,7 @@ def _iqm(values: NDArray[np.float64]) -> str:
     return number(interquartile_mean(values))
 
 
-def _dqn_values(methods: Methods) -> list[str | Table]:
+def _dqn_values(methods: Methods) -> list[str | TextTable]:
     """The target's values per method at the end, late and over the whole curve."""
     columns = {
         "seeds": seeds_cell,
@@ -160,4 +160,4 @@ def _dqn_values(methods: Methods) -> list[str | Table]:
         "late greedy return": lambda v: mean_cell(late(v, "greedy_return")),
         "area": lambda v: mean_cell(area(v, "return")),
     }
-    return [LATE, by_method(methods, columns)]
+    return [_LATE, by_method(methods, columns)]

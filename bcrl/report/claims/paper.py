@@ -80,7 +80,7 @@ NEAR_OPTIMUM = Quantity(
     f"(return − V*(s0)) / |V*(s0)| + {NEAR:g}, last iteration",
     lambda v: (v.last("return") - _optimum(v)) / abs(_optimum(v)) + NEAR,
 )
-LATE = Quantity("late return", lambda v: late(v, "return"))
+LATE_RETURN = Quantity("late return", lambda v: late(v, "return"))
 
 #: BC-FQI ends with the smallest error and the largest return of all methods.
 BEST = tuple(
@@ -123,7 +123,7 @@ MAZE_CLAIMS = (
 LINEAR_CLAIMS = tuple(
     Claim(
         f"{a} {words} {b}",
-        LATE,
+        LATE_RETURN,
         "> 0" if words == "ends better than" else "≤ 0",
         (a, b),
     )

@@ -16,11 +16,11 @@ from bcrl.report.statistics import bootstrap_curves, standard_error
 from bcrl.report.variants import Methods, Runs, Variant
 
 POINTS = 300  # of a curve that are drawn, about
-COLUMNS = 3  # panels beside each other
+_COLUMNS = 3  # panels beside each other
 #: What counts a family's rows, as an axis says it.
 COUNTED = {"FQI": "iteration", "DQN": "environment steps of all stages"}
 #: What an axis says of a metric (docs/metrics.md defines them); others by their names.
-LABELS = {
+_LABELS = {
     ("FQI", "return"): "discounted return",
     ("FQI", "q_error"): "error, mean |Q − Q*|",
     ("FQI", "q_error_start"): "error at the start, |Q − V*|",
@@ -34,14 +34,14 @@ LABELS = {
     ("DQN", "greedy_success_rate"): "success rate, greedy",
     ("DQN", "q_mean"): "value at the start, max Q",
 }
-SEEDS = {"linewidth": 0.5, "linestyle": (0, (3, 2)), "alpha": 0.45, "zorder": 1.9}
-TWO_ERRORS = "mean ± 2 standard errors over seeds"
-Interval = tuple[NDArray[np.float64], NDArray[np.float64]]
+_SEEDS = {"linewidth": 0.5, "linestyle": (0, (3, 2)), "alpha": 0.45, "zorder": 1.9}
+_TWO_ERRORS = "mean ± 2 standard errors over seeds"
+Band = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def label(family: str, metric: str) -> str:
     """A metric in words."""
-    return LABELS.get((family, metric), metric.replace("_", " "))
+    return _LABELS.get((family, metric), metric.replace("_", " "))
 
 
 def optimum_of(methods: Methods) -> float | None:
@@ -50,7 +50,7 @@ def optimum_of(methods: Methods) -> float | None:
     return optima.pop() if len(optima) == 1 else None
 
 
-def two_errors(values: NDArray[np.float64]) -> Interval:
+def two_errors(values: NDArray[np.float64]) -> Band:
     """Mean ± 2 standard errors of (S, P) values, (P,) each."""
     centre, half = values.mean(axis=0), 2 * standard_error(values)
     return centre - half, centre + half
@@ -74,7 +74,7 @@ def draw_metric(
     methods: Methods,
     metric: str,
     rows: Callable[[Variant], NDArray[np.intp]] = every,
-    interval: Callable[[NDArray[np.float64]], Interval] | None = two_errors,
+    interval: Callable[[NDArray[np.float64]], Band] | None = two_errors,
 ) -> None:
     """Every method's mean over seeds with a band, or with all seeds if no `interval`.
 
@@ -92,7 +92,7 @@ def draw_metric(
                 axes.fill_between(x, low, high, **fill)
                 drawn = [values.mean(axis=0), low, high]
             else:
-                axes.plot(x, values.T, **SEEDS, color=line["color"])
+                axes.plot(x, values.T, **_SEEDS, color=line["color"])
             width = 1.6 if interval else 2.0
             axes.plot(x, values.mean(axis=0), linewidth=width, **line)
             diverges = metric in diverging(variant.metrics)
@@ -121,9 +121,9 @@ def figure_curves(runs: Runs, env: str, family: str, tag: str | None = None) -> 
     """One panel per metric: mean and 95 % interval of every method, tasks shaded."""
     methods = runs.tagged(env, family, tag)
     metrics, spans = metrics_of(methods), shared_spans(methods)
-    columns = min(COLUMNS, len(metrics))
+    columns = min(_COLUMNS, len(metrics))
     rows = math.ceil(len(metrics) / columns)
-    size = max(0.6, columns / 2) * style.WIDTH, 2.5 * rows + 0.7
+    size = max(0.6, columns / 2) * style.TEXT_WIDTH, 2.5 * rows + 0.7
     figure = Figure(figsize=size)
     panels = list(figure.subplots(rows, columns, squeeze=False).flat)
     for axes, metric in zip(panels, metrics, strict=False):
@@ -161,7 +161,7 @@ def figure_1(runs: Runs, tag: str | None = None) -> Figure:
     """Car on the hill: error and return, every seed and their mean (paper, Fig. 1)."""
     methods, metrics = runs.methods("car_on_hill", tag), ("q_error", "return")
     labels = [label("FQI", metric) for metric in metrics]
-    figure, panels = _panels(methods, labels, (style.WIDTH, 3.3))
+    figure, panels = _panels(methods, labels, (style.TEXT_WIDTH, 3.3))
     for axes, metric in zip(panels, metrics, strict=True):
         draw_metric(axes, methods, metric, interval=None)
     style.legend(figure, methods)
@@ -183,7 +183,7 @@ def figure_2(runs: Runs, tag: str | None = None) -> Figure:
         "return": "discounted return",
         "q_error": "error in the trained task\nmean |Q − Q*|",
     }
-    size = (1.4 * style.WIDTH, 3.2)
+    size = (1.4 * style.TEXT_WIDTH, 3.2)
     figure, panels = _panels(methods, list(labels.values()), size)
     for axes, metric in zip(panels, labels, strict=True):
         draw_metric(axes, methods, metric)
@@ -193,7 +193,7 @@ def figure_2(runs: Runs, tag: str | None = None) -> Figure:
     if optimum is not None:
         panels[1].axhline(optimum, **style.OPTIMUM)
     style.legend(figure, methods, optimum=optimum is not None)
-    style.footer(figure, runs, methods, TWO_ERRORS)
+    style.footer(figure, runs, methods, _TWO_ERRORS)
     return figure
 
 
@@ -201,9 +201,9 @@ def figure_5(runs: Runs, tag: str | None = None) -> Figure:
     """Maze: BC-FQI's residual at s0, averaged over actions (paper, Fig. 5)."""
     methods = {"BC-FQI": runs.methods("maze", tag)["BC-FQI"]}
     ylabel = "residual at the start\n" + r"mean$_a$ ϱ$_t$(s$_0$, a)"
-    figure, (axes,) = _panels(methods, [ylabel], (0.75 * style.WIDTH, 3.0))
+    figure, (axes,) = _panels(methods, [ylabel], (0.75 * style.TEXT_WIDTH, 3.0))
     axes.axhline(0.0, color="0.6", linewidth=0.6)
     draw_metric(axes, methods, "residual_start")
     style.legend(figure, methods)
-    style.footer(figure, runs, methods, TWO_ERRORS, compares=False)
+    style.footer(figure, runs, methods, _TWO_ERRORS, compares=False)
     return figure

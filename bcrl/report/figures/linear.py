@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bcrl.report.figures import style
 from bcrl.report.figures.curves import draw_metric
 from bcrl.report.late import (
-    LEARNERS,
+    LEARNER_NAMES,
     LINEAR,
     pretraining,
     pretraining_rows,
@@ -22,33 +22,33 @@ from bcrl.report.late import (
 from bcrl.report.variants import Methods, Runs, Variant
 from bcrl.results.read import bad_file
 
-WORST = -150.0  # target return of a policy that never succeeds: −1 in each of 150 steps
-SHOWN_SEED = {"lspi": 0, "dqn": 10}  # whose Q the paper's Figure 4b shows
-SOURCES = {"lspi": "LSPI", "dqn": "C-DQN"}  # learner → whose colour it has
-APART = 0.18  # share of the axis below which neighbouring labels take two rows
-EVERY = 4  # grid points per arrow
-SMALL = {"fontsize": 6.5, "color": "0.35", "textcoords": "offset points"}
+_WORST = -150.0  # target return of a policy that never succeeds: −1 in 150 steps
+_SHOWN_SEED = {"lspi": 0, "dqn": 10}  # whose Q the paper's Figure 4b shows
+_SOURCES = {"lspi": "LSPI", "dqn": "C-DQN"}  # learner → whose colour it has
+_APART = 0.18  # share of the axis below which neighbouring labels take two rows
+_EVERY = 4  # grid points per arrow
+_SMALL = {"fontsize": 6.5, "color": "0.35", "textcoords": "offset points"}
 NO_RUNS = {"ha": "center", "va": "center", "color": "0.5"}
 
 
 def _draw_target(axes: Axes, methods: Methods) -> None:
-    axes.axhline(WORST, color="0.6", linewidth=0.6)
+    axes.axhline(_WORST, color="0.6", linewidth=0.6)
     place = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "top"}
-    axes.annotate("never succeeding", (1.0, WORST), (0, -2), **place, **SMALL)
+    axes.annotate("never succeeding", (1.0, _WORST), (0, -2), **place, **_SMALL)
     draw_metric(axes, methods, "return", target_rows)
     end = max(int(variant.index[-1]) for variant in methods.values())
     axes.set_xlim(0, 1.03 * end)
     bottom, top = axes.get_ylim()
-    axes.set_ylim(bottom=min(bottom, WORST - 0.07 * (top - WORST)))  # room for a word
+    axes.set_ylim(bottom=min(bottom, _WORST - 0.07 * (top - _WORST)))  # room for a word
     previous = -np.inf
     place = {"xycoords": ("data", "axes fraction"), "ha": "left", "va": "bottom"}
     for (learner, step), label in sorted(
         switches(methods).items(), key=lambda item: item[0][1]
     ):
-        colour = style.colour(SOURCES[learner]) if learner in SOURCES else "0.5"
+        colour = style.colour(_SOURCES[learner]) if learner in _SOURCES else "0.5"
         axes.axvline(step, color=colour, linestyle=":")
-        raised = 10 if step - previous < APART * end else 2
-        axes.annotate(label, (step, 1.0), (0, raised), **place, **SMALL)
+        raised = 10 if step - previous < _APART * end else 2
+        axes.annotate(label, (step, 1.0), (0, raised), **place, **_SMALL)
         previous = step
     axes.set_ylabel("return in the target task (undiscounted)")
 
@@ -56,10 +56,10 @@ def _draw_target(axes: Axes, methods: Methods) -> None:
 def _draw_pretraining(axes: Axes, methods: Methods) -> None:
     handles = []
     for learner, variant in pretraining(methods).items():
-        source, n = SOURCES[learner], len(variant.seeds)
+        source, n = _SOURCES[learner], len(variant.seeds)
         shown = {source: variant}
         draw_metric(axes, shown, "discounted_return", pretraining_rows)
-        label = f"{LEARNERS[learner]}, {n} seed{'s' * (n != 1)}"
+        label = f"{LEARNER_NAMES[learner]}, {n} seed{'s' * (n != 1)}"
         line = {"color": style.colour(source), "linewidth": 2, "label": label}
         handles.append(Line2D([], [], **line))
     if handles:
@@ -76,7 +76,7 @@ def figure_4a(runs: Runs, tag: str | None = None) -> Figure:
     Mean ± 2 standard errors over seeds, under the exploring policy (paper, Fig. 4a).
     """
     methods = runs.compared(LINEAR, tag, "DQN")
-    figure = Figure(figsize=(1.3 * style.WIDTH, 3.5))
+    figure = Figure(figsize=(1.3 * style.TEXT_WIDTH, 3.5))
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
     _draw_target(left, methods)
     _draw_pretraining(right, methods)
@@ -117,18 +117,18 @@ def axes_of_grid(
 
 def _draw_prior(axes: Axes, learner: str, variant: Variant | None) -> None:
     axes.set(xlabel="position x", ylabel="position y", aspect="equal")
-    name = LEARNERS[learner].removesuffix(" on LQ")
+    name = LEARNER_NAMES[learner].removesuffix(" on LQ")
     title = rf"{name}: max$_a$ Q in the LQ task"
     if variant is None:
         axes.set_title(title, pad=4)
         axes.set(xlim=(-5, 5), ylim=(-5, 5))
         axes.text(0, 0, "no runs", **NO_RUNS)
         return
-    wished = SHOWN_SEED[learner]
+    wished = _SHOWN_SEED[learner]
     seed = wished if wished in variant.seeds else min(variant.seeds)
     x, y, value, force = prior(variant, seed)
     image = axes.pcolormesh(x, y, value.T, cmap="viridis", rasterized=True)
-    at = slice(None, None, EVERY)
+    at = slice(None, None, _EVERY)
     fx, fy = force[at, at, 0].T, force[at, at, 1].T
     look = {"color": "white", "edgecolor": "black", "linewidth": 0.4}
     axes.quiver(x[at], y[at], fx, fy, pivot="middle", scale=16, width=0.009, **look)
@@ -181,9 +181,9 @@ def figure_4b(runs: Runs, tag: str | None = None) -> Figure:
     """
     methods = runs.compared(LINEAR, tag, "DQN")
     found = pretraining(methods)
-    figure = Figure(figsize=(1.45 * style.WIDTH, 3.8))  # so high that widths decide
+    figure = Figure(figsize=(1.45 * style.TEXT_WIDTH, 3.8))  # widths decide
     panels = figure.subplots(1, 3, width_ratios=(1.15, 1.15, 1))
-    for axes, learner in zip(panels, LEARNERS, strict=False):
+    for axes, learner in zip(panels, LEARNER_NAMES, strict=False):
         _draw_prior(axes, learner, found.get(learner))
     variant = next(iter(methods.values()))
     _draw_environment(panels[2], variant)

@@ -15,10 +15,10 @@ from bcrl.report.figures.linear import NO_RUNS, axes_of_grid
 from bcrl.report.variants import METHODS, Methods, Runs, Variant
 from bcrl.results.read import bad_file
 
-SIZE = (11.4, 4.2)  # inches
-MARGIN = 0.025  # half a lattice cell
-SPREAD = 0.012  # how far apart the seeds' trajectories are drawn, in maze lengths
-SHOWN_MAZES = 4
+_SIZE = (11.4, 4.2)  # inches
+_MARGIN = 0.025  # half a lattice cell
+_SPREAD = 0.012  # how far apart the seeds' trajectories are drawn, in maze lengths
+_SHOWN_MAZES = 4
 
 
 def _draw_walls(axes: Axes, walls: NDArray[np.float64], filled: bool = True) -> None:
@@ -40,7 +40,7 @@ def _draw_ends(axes: Axes, goal: NDArray, start: NDArray) -> None:
 
 def _frame(axes: Axes, title: str) -> None:
     """The unit square, without ticks."""
-    axes.set(xlim=(-MARGIN, 1 + MARGIN), ylim=(-MARGIN, 1 + MARGIN), aspect="equal")
+    axes.set(xlim=(-_MARGIN, 1 + _MARGIN), ylim=(-_MARGIN, 1 + _MARGIN), aspect="equal")
     axes.set(xticks=[], yticks=[])
     axes.set_title(title, pad=3, fontsize=8)
     axes.spines[:].set_visible(True)
@@ -88,7 +88,7 @@ def _draw_paths(
     _draw_walls(axes, walls)
     paths = trajectories(variant)
     # Lattice paths coincide: drawn side by side, one can see how many there are.
-    shifts = np.linspace(-SPREAD, SPREAD, len(paths)) if len(paths) > 1 else [0.0]
+    shifts = np.linspace(-_SPREAD, _SPREAD, len(paths)) if len(paths) > 1 else [0.0]
     look = {"color": style.colour(name), "linewidth": 0.7, "alpha": 0.6, "zorder": 3}
     for path, shift in zip(paths, shifts, strict=True):
         axes.plot(path[:, 0] + shift, path[:, 1] - shift, **look)
@@ -117,7 +117,7 @@ def figure_3(runs: Runs, tag: str | None = None) -> Figure:
     reference = max(methods.values(), key=lambda v: len(np.unique(v.task)))
     names = ("walls", "goal", "trajectory")
     walls, goal, path = reference.arrays(reference.seeds[0], *names)
-    figure = Figure(figsize=SIZE)
+    figure = Figure(figsize=_SIZE)
     figure.get_layout_engine().set(w_pad=0.07)
     target = f"T{len(walls)}"
     titles = (
@@ -128,7 +128,7 @@ def figure_3(runs: Runs, tag: str | None = None) -> Figure:
     panels = figure.subfigures(1, 3, width_ratios=(1.0, 1.28, 1.0), wspace=0.03)
     for panel, title in zip(panels, titles, strict=True):
         panel.suptitle(title, fontsize=9)
-    shown = np.linspace(0, len(walls) - 1, SHOWN_MAZES).round().astype(int)
+    shown = np.linspace(0, len(walls) - 1, _SHOWN_MAZES).round().astype(int)
     for axes, task in zip(panels[0].subplots(2, 2).flat, shown, strict=True):
         _draw_walls(axes, walls[task])
         _draw_ends(axes, goal, path[0])

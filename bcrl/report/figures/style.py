@@ -36,15 +36,15 @@ COLOURS = {
     "PPR": "#8C8C8C",
     "LSPI": "#7A4B1E",  # pretraining only
 }
-BANDS = ("#EBEBEB", "#F8F8F8")
+_BANDS = ("#EBEBEB", "#F8F8F8")
 OPTIMUM = {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 1.0}
 
-DPI = 150
-WIDTH = 7.2  # inches, a full text width
-NARROW = 0.055  # share of an axis below which neighbouring labels take two rows
-FOOTER_WIDTH = 20  # characters of small print per inch
+_DPI = 150
+TEXT_WIDTH = 7.2  # inches, a full text width
+_NARROW = 0.055  # share of an axis below which neighbouring labels take two rows
+_FOOTER_WIDTH = 20  # characters of small print per inch
 
-RC = {
+_RC = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine
     "font.size": 8.0,
     "axes.labelsize": 8.5,
@@ -68,7 +68,7 @@ Span = tuple[str, float, float]  # a task's name, where it begins and ends
 def sheet() -> AbstractContextManager[None]:
     """The style, to be in force while a figure is drawn and while it is saved."""
     defaults = {k: v for k, v in matplotlib.rcParamsDefault.items() if k != "backend"}
-    return matplotlib.rc_context({**defaults, **RC})
+    return matplotlib.rc_context({**defaults, **_RC})
 
 
 def colour(method: str) -> str:
@@ -111,8 +111,8 @@ def shade_tasks(axes: Axes, spans: Sequence[Span]) -> None:
     axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True, steps=[1, 2, 5, 10]))
     row, previous_narrow = 0, False
     for number, (label, start, end) in enumerate(spans):
-        axes.axvspan(start, end, color=BANDS[number % 2], linewidth=0, zorder=0)
-        narrow = (end - start) / (last - first) < NARROW
+        axes.axvspan(start, end, color=_BANDS[number % 2], linewidth=0, zorder=0)
+        narrow = (end - start) / (last - first) < _NARROW
         row = 1 - row if narrow and previous_narrow else 0
         previous_narrow = narrow
         small = {"ha": "center", "va": "bottom", "fontsize": 7, "color": "0.35"}
@@ -168,7 +168,7 @@ def footer(
     parts = [env_title(env), f"scale {runs.scale}", seeds, tags_shown(methods), what]
     lines = [" · ".join(filter(None, parts))]
     lines += remarks(runs.notes, methods, compares)
-    limit = int(figure.get_figwidth() * FOOTER_WIDTH)
+    limit = int(figure.get_figwidth() * _FOOTER_WIDTH)
     text = "\n".join(part for line in lines for part in textwrap.wrap(line, limit))
     figure.supxlabel(text, x=0.01, ha="left", fontsize=6.5, color="0.35")
 
@@ -181,13 +181,13 @@ def colour_bar(axes: Axes, image: Any, shrink: float, aspect: float) -> Any:
     return bar
 
 
-def save(figure: Figure, folder: Path, name: str, title: str) -> list[Path]:
+def save_figure(figure: Figure, folder: Path, name: str, title: str) -> list[Path]:
     """Write `name`.png and `name`.pdf, atomically and without a date inside."""
     software = f"bcrl {__version__}"
     pdf = {"Title": title, "Creator": software, "CreationDate": None}
     files = []
     for kind, about in (("png", {"Title": title, "Software": software}), ("pdf", pdf)):
-        options = {"format": kind, "dpi": DPI, "metadata": about}
+        options = {"format": kind, "dpi": _DPI, "metadata": about}
         write = partial(figure.savefig, **options)
         files.append(write_atomically(folder / f"{name}.{kind}", write))
     return files
