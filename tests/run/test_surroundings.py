@@ -200,7 +200,7 @@ def test_a_full_or_closed_output_is_no_traceback(command, tmp_path):
 @pytest.mark.parametrize("closed", ["<&- >&- 2>&-", ">&-", "2>&-"])
 def test_closed_streams_take_no_file(closed, tmp_path):
     program = (
-        "from bcrl.terminal import ready, say, show; ready(); import subprocess, sys;"
+        "from bcrl.common.terminal import ready, say, show; ready(); import subprocess, sys;"
         "file = open('result', 'w'); show('shown'); say('said');"
         "subprocess.run([sys.executable, '-c', 'print(1)']);"
         "file.write(str(file.fileno() > 2)); file.close()"
