@@ -4,6 +4,9 @@ import os as _os
 import signal as _signal
 import sys as _sys
 
+from bcrl.common import moved as _moved
+from bcrl.common import registration as _registration
+
 __version__ = "0.1.0"
 
 if (
@@ -12,4 +15,5 @@ if (
 ):  # a command starts: until there is work to save, Ctrl-C ends it without a word
     _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 
-import bcrl.gym  # noqa: F401  registers our environments with Gymnasium
+_moved.install()
+_registration.register_with_gymnasium()

@@ -16,25 +16,30 @@ from pathlib import Path
 import pandas as pd
 from tqdm import tqdm
 
-from bcrl import compiling, probes
-from bcrl.composition import Composition, order_of
+from bcrl.common import compiling
+from bcrl.common.files import seed_path, seeds_of
+from bcrl.config.rules import course
+from bcrl.config.variant import Composition, order_of
 from bcrl.envs import Env, check_tasks, is_simulated
 from bcrl.envs.car_on_hill import CarOnHill
 from bcrl.envs.gymnasium import Gymnasium
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.envs.maze import Maze
 from bcrl.errors import BcrlError, ConfigError
-from bcrl.evaluation import StepProbe
-from bcrl.files import seed_path, seeds_of
-from bcrl.learners.dqn import DQN
-from bcrl.learners.fqi import FQI
-from bcrl.learners.lspi import LSPI
-from bcrl.q.regressors import ForestRegressor as Forest
-from bcrl.q.regressors import Tabular
-from bcrl.q.scikit import Sklearn
-from bcrl.rules import course
-from bcrl.stage import Course, Learner, Snapshot, Stage, Team, snapshots
-from bcrl.transfer import (
+from bcrl.evaluation import metrics as probes
+from bcrl.evaluation.step_metrics import StepProbe
+from bcrl.learning.dqn import DQN
+from bcrl.learning.fqi import FQI
+from bcrl.learning.lspi import LSPI
+from bcrl.learning.stage import (
+    CurriculumRun,
+    Learner,
+    SeedBatch,
+    Snapshot,
+    Stage,
+    snapshots,
+)
+from bcrl.learning.transfer import (
     Boost,
     PolicyReuse,
     ResidualPolicy,
@@ -42,7 +47,10 @@ from bcrl.transfer import (
     Transfer,
     warm_start,
 )
-from bcrl.workers import cores
+from bcrl.q.regressors.ours import ForestRegressor as Forest
+from bcrl.q.regressors.ours import Tabular
+from bcrl.q.regressors.scikit import Sklearn
+from bcrl.run.workers import cores
 
 __all__ = [
     "DQN",
@@ -146,11 +154,11 @@ def run(
         probe = probes.Probe(seeds, tasks, metrics)
     else:
         probe = StepProbe(seeds, tasks)
-    team = Team(seeds, probe.states, threads or cores())
+    team = SeedBatch(seeds, probe.states, threads or cores())
     rows = []
     length = sum(stage.learner.length for stage in course)
     with tqdm(total=length, unit=probe.index, disable=not progress) as bar:
-        for now in snapshots(Course(course, team)):
+        for now in snapshots(CurriculumRun(course, team)):
             rows += _rows(now, probe, seeds)
             bar.set_description_str(f"task {now.stage.task}", refresh=False)
             bar.update(now.count - bar.n)

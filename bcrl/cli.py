@@ -14,15 +14,15 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from bcrl import guard, shell
-from bcrl.composed import CONF, CONFIG_NAME
+from bcrl.common.files import make_directory
+from bcrl.common.signals import EXIT_CODE, Interrupted, heard
+from bcrl.common.terminal import ready, say, show
+from bcrl.config import guard, shell
+from bcrl.config.hydra_compose import CONF, CONFIG_NAME
 from bcrl.errors import BcrlError
-from bcrl.files import make_directory
-from bcrl.interrupts import EXIT_CODE, Interrupted, heard
-from bcrl.terminal import ready, say, show
 
 if TYPE_CHECKING:
-    from bcrl.compose import Plan
+    from bcrl.config.plan import Plan
 
 
 def main() -> None:
@@ -41,7 +41,7 @@ def main() -> None:
             if plans := _vet(arguments):
                 make_directory(plans[0].root, "runs_dir")
         if plans:
-            from bcrl import runner
+            from bcrl.run import runner
 
             heard()
             runner.run(*plans)
@@ -62,7 +62,9 @@ def _vet(arguments: Namespace) -> list[Plan]:
     if arguments.hydra_help or arguments.shell_completion:
         _by_hydra(arguments)
         return []
-    from bcrl import overview, records, vetting
+    from bcrl.config import vetting
+    from bcrl.run import records
+    from bcrl.run import status as overview
 
     if arguments.status:
         show(overview.status(arguments))
@@ -78,9 +80,9 @@ def _vet(arguments: Namespace) -> list[Plan]:
         _by_hydra(arguments)
         return []
     if vetting.left_to_hydra(arguments):
-        from bcrl import launching, runner
+        from bcrl.run import launchers, runner
 
-        launching.register()
+        launchers.register()
         heard()
         _by_hydra(arguments)
         runner.check_complete(plans)
@@ -93,7 +95,8 @@ def _run_job(composed: DictConfig) -> int:
 
     An error is said and no more: other jobs go on, and in the end their files tell.
     """
-    from bcrl import runner, vetting
+    from bcrl.config import vetting
+    from bcrl.run import runner
 
     guard.register()
     GlobalHydra.instance().clear()  # Hydra has composed; vetting does, to compare

@@ -12,7 +12,8 @@ import tempfile
 import time
 from argparse import Namespace
 
-from bcrl import checkpoints, config, records, runner, vetting
+from bcrl.config import schema, vetting
+from bcrl.run import checkpoints, records, runner
 
 CHOICES = {
     "maze FQI": ["env=maze", "seeds.count=4"],
@@ -40,7 +41,7 @@ class Timed:
 
 
 def main(every: str = "60") -> None:
-    config.register()
+    schema.register()
     print(f"{'':14}{'run, s':>8}{'written':>9}{'MiB':>8}{'ms each':>9}{'share':>8}")
     for name, choice in CHOICES.items():
         with tempfile.TemporaryDirectory() as folder:

@@ -19,10 +19,10 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from bcrl.envs.linear_system import LinearSystem
-from bcrl.evaluation import evaluate
-from bcrl.learners.dqn import DQN
-from bcrl.stage import Moment, Stage, Team, snapshots
-from bcrl.transfer import Start
+from bcrl.evaluation.step_metrics import evaluate
+from bcrl.learning.dqn import DQN
+from bcrl.learning.stage import SeedBatch, Stage, StepSnapshot, snapshots
+from bcrl.learning.transfer import StageInit
 
 ENV, STEPS, FILL = LinearSystem(), 1000, 600
 
@@ -73,12 +73,12 @@ def plain() -> Iterator[None]:
         yield
 
 
-def lockstep(n_seeds: int) -> Iterator[Moment]:
+def lockstep(n_seeds: int) -> Iterator[StepSnapshot]:
     """Many seeds, STEPS steps at each `next`."""
     learner = DQN(steps=10**9, evaluate_every=STEPS)
     stage = Stage(1, 1, ENV, learner, (), 0)
-    team = Team(tuple(range(n_seeds)), np.zeros((1, 4)))
-    return snapshots(learner.learn(stage, Start(), team))
+    team = SeedBatch(tuple(range(n_seeds)), np.zeros((1, 4)))
+    return snapshots(learner.learn(stage, StageInit(), team))
 
 
 def main() -> None:

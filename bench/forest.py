@@ -16,7 +16,7 @@ from sklearn.ensemble import ExtraTreesRegressor
 from threadpoolctl import threadpool_limits
 from timing import by_turns
 
-from bcrl.q.forest import Regression, TreeSettings, fit_forests
+from bcrl.q.forest.forest import Regression, TreeSettings, fit_forests
 
 TREES = 50
 PAPER = TreeSettings(min_samples_split=5, min_samples_leaf=2)

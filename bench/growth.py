@@ -19,12 +19,12 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from bcrl.envs.car_on_hill import CarOnHill
-from bcrl.learners.fqi import FQI, Iteration
-from bcrl.probes import probed_states
-from bcrl.q import Q, Sum
-from bcrl.q.regressors import ForestRegressor
-from bcrl.stage import Stage, Team
-from bcrl.transfer import Start, begin
+from bcrl.evaluation.metrics import probed_states
+from bcrl.learning.fqi import FQI, Iteration
+from bcrl.learning.stage import SeedBatch, Stage
+from bcrl.learning.transfer import StageInit, begin
+from bcrl.q.functions import Q, Sum
+from bcrl.q.regressors.ours import ForestRegressor
 
 ENV, RESIDUAL, EARLY, TURNS = CarOnHill(mass=1.2), 40, 11, 6
 
@@ -36,11 +36,11 @@ def stage(episodes: int, reuse: bool = False) -> Stage:
 
 
 def iterations(
-    episodes: int, seeds: int = 1, start: Start | None = None
+    episodes: int, seeds: int = 1, start: StageInit | None = None
 ) -> Iterator[Iteration]:
     """Iterations of as many seeds in lockstep, from nothing or from `start`."""
     now = stage(episodes, start is not None)
-    team = Team(tuple(range(seeds)), probed_states(ENV))
+    team = SeedBatch(tuple(range(seeds)), probed_states(ENV))
     return now.learner.learn(now, start or begin((), None), team)
 
 
@@ -76,14 +76,14 @@ def by_turns(runs: list[Iterator[Iteration]]) -> list[tuple[float, float]]:
 def residuals() -> None:
     """An iteration at residual 1 and at residual 40, of the same dataset."""
     *_, first = itertools.islice(iterations(1000), EARLY)
-    on_one = replace(Start(first.learned), base=first.learned.q)
+    on_one = replace(StageInit(first.learned), base=first.learned.q)
     run = iterations(1000, 1, on_one)
     frozen = [now.learned.residual for now in itertools.islice(run, 3)]
     # 39 different residuals would take minutes to learn: three serve in turn, each
     # looked through from the root every time.
     terms = [first.learned.q, *(frozen[i % 3] for i in range(RESIDUAL - 2))]
     base = Stopwatch(Sum(tuple(terms)))
-    nothing = Start(first.learned)
+    nothing = StageInit(first.learned)
     starts = (nothing, replace(nothing, base=base))
     one, forty = by_turns([iterations(1000, 1, start) for start in starts])
     points = len(first.learned.data[0].points)

@@ -15,14 +15,14 @@ import numpy as np
 from sklearn.ensemble import ExtraTreesRegressor
 from threadpoolctl import threadpool_limits
 
-from bcrl import bellman
 from bcrl.envs import Env
 from bcrl.envs.car_on_hill import CarOnHill
 from bcrl.envs.maze import Maze
-from bcrl.learners.fqi import FQI, Iteration
-from bcrl.probes import probed_states
-from bcrl.q.regressors import ForestRegressor
-from bcrl.stage import Stage, Team, learn
+from bcrl.evaluation.metrics import probed_states
+from bcrl.learning import bellman
+from bcrl.learning.fqi import FQI, Iteration
+from bcrl.learning.stage import SeedBatch, Stage, learn
+from bcrl.q.regressors.ours import ForestRegressor
 
 
 class Plain:
@@ -52,7 +52,7 @@ def compare(name: str, env: Env, episodes: int, repeats: int) -> None:
     """Print one row: transitions, ms of both, ratio, after a few iterations each."""
     learner = FQI(10**9, episodes, ForestRegressor())
     stage = Stage(1, 1, env, learner, (), 0)
-    ours = learn([stage], Team((0,), probed_states(env)))
+    ours = learn([stage], SeedBatch((0,), probed_states(env)))
     plain = Plain(env, next(ours))  # the first collects the data and compiles
     plain.iterate()
     steps: list[Callable[[], object]] = [plain.iterate, lambda: next(ours)]

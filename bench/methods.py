@@ -16,12 +16,12 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from bcrl import config, vetting
-from bcrl.compose import Plan
-from bcrl.evaluation import evaluate
-from bcrl.learners.lockstep import Lockstep
-from bcrl.stage import Team, learn
-from bcrl.transfer import begin
+from bcrl.config import schema, vetting
+from bcrl.config.plan import Plan
+from bcrl.evaluation.step_metrics import evaluate
+from bcrl.learning.lockstep import DQNTrainer
+from bcrl.learning.stage import SeedBatch, learn
+from bcrl.learning.transfer import begin
 
 METHODS = ("plain", "C", "BC", "SC", "SBC", "RPL", "PPR")
 SEEDS, TEAM, STEPS = 100, 20, 500
@@ -37,13 +37,13 @@ def planned(variant: str) -> Plan:
     return plan
 
 
-def running(plan: Plan, seeds: tuple[int, ...]) -> Lockstep:
+def running(plan: Plan, seeds: tuple[int, ...]) -> DQNTrainer:
     """A team in its target task with a full replay."""
-    team, learned = Team(seeds, np.zeros((1, 4))), None
+    team, learned = SeedBatch(seeds, np.zeros((1, 4))), None
     for now in learn(plan.stages[:-1], team):
         learned = now.learned
     last = plan.stages[-1]
-    run = Lockstep(last.learner, last, begin(last.transfers, learned), team)
+    run = DQNTrainer(last.learner, last, begin(last.transfers, learned), team)
     for _ in range(last.learner.replay_size):
         run.act()
         run.end_step()
@@ -53,7 +53,7 @@ def running(plan: Plan, seeds: tuple[int, ...]) -> Lockstep:
     return run
 
 
-def cost(run: Lockstep) -> tuple[float, float]:
+def cost(run: DQNTrainer) -> tuple[float, float]:
     """Seconds of CPU of a step with its update, and of an evaluation a step."""
     n = len(run.team.seeds)
     began = time.process_time()
@@ -81,7 +81,7 @@ def multiplying() -> float:
 
 
 def main() -> None:
-    config.register()
+    schema.register()
     torch.set_num_threads(1)
     print(
         f"this core multiplies (32, 128) by (128, 128) at {multiplying():.0f} GFLOP/s"

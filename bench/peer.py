@@ -29,10 +29,10 @@ from timing import by_turns
 
 from bcrl.envs.car_on_hill import CarOnHill
 from bcrl.envs.linear_system import LinearSystem
-from bcrl.learners.fqi import FQI
-from bcrl.probes import probed_states
-from bcrl.q.regressors import ForestRegressor
-from bcrl.stage import Stage, Team, learn
+from bcrl.evaluation.metrics import probed_states
+from bcrl.learning.fqi import FQI
+from bcrl.learning.stage import SeedBatch, Stage, learn
+from bcrl.q.regressors.ours import ForestRegressor
 
 EPISODES, EARLY = 1000, 6
 
@@ -98,7 +98,7 @@ def their_fqi() -> Callable[[], object]:
 def our_fqi() -> Callable[[], object]:
     env = CarOnHill(mass=1.0)
     stage = Stage(1, 1, env, FQI(10**9, EPISODES, ForestRegressor()), (), 0)
-    run = learn([stage], Team((0,), probed_states(env)))
+    run = learn([stage], SeedBatch((0,), probed_states(env)))
     (data,) = next(run).learned.data
     print(f"our dataset: {int(data.multiplicity.sum())} transitions")
     return lambda: next(run)

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from bcrl import guard, vetting
-from bcrl.compose import Plan
+from bcrl.config import guard, vetting
+from bcrl.config.plan import Plan
 
 guard.register()
 

@@ -11,9 +11,10 @@ import pandas as pd
 import yaml
 from numpy.typing import NDArray
 
-from bcrl import files, records
-from bcrl.compose import Plan
+from bcrl.common import files
+from bcrl.config.plan import Plan
 from bcrl.report.seedfiles import METRICS
+from bcrl.run import records
 
 
 def made_up_plan(

@@ -7,12 +7,12 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from bcrl import runner
-from bcrl.drawing import draw
 from bcrl.envs.car_on_hill import CarOnHill
+from bcrl.envs.rendering import draw
 from bcrl.report.animation import frames, typical_seed
 from bcrl.report.cli import main
 from bcrl.report.load import load_runs
+from bcrl.run import runner
 from tests.conftest import plan
 from tests.made_up import made_up_plan, write_seeds
 

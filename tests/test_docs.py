@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from bcrl import overview, shell, vetting
+from bcrl.config import shell, vetting
+from bcrl.run import status as overview
 
 ROOT = Path(__file__).parents[1]
 #: tests/test_other_packages.py runs this section's commands.

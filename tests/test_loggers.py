@@ -10,10 +10,11 @@ import pandas as pd
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from bcrl import loggers, runner
+from bcrl.common.signals import Interrupted
 from bcrl.errors import ConfigError
-from bcrl.interrupts import Interrupted
 from bcrl.report.integrity import check_tree
+from bcrl.results import loggers
+from bcrl.run import runner
 from tests.conftest import plan
 
 BC = ("env=maze", "variant=BC", "scale=smoke", "seeds.count=2", "progress=none")
@@ -94,9 +95,9 @@ def test_steps_are_logged_and_gaps_left_out(tmp_path):
 
 def test_an_interrupted_run_logs_nothing_twice(tmp_path, monkeypatch):
     """Stopped after a while, gone on with in a new event file."""
-    from bcrl import training
+    from bcrl.run import job as training
 
-    look, seen = training._look, []
+    look, seen = training._measure, []
 
     def counted(probe, now, session, log):
         look(probe, now, session, log)

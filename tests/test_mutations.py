@@ -16,8 +16,8 @@ import pandas as pd
 import pytest
 import yaml
 
+from bcrl.common.identity import identity
 from bcrl.errors import BcrlError
-from bcrl.identity import identity
 from bcrl.report import verify
 from bcrl.report.load import load_runs
 from bcrl.report.seedfiles import DQN_METRICS, METRICS

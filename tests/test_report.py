@@ -12,7 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 from scipy import stats
 
-from bcrl import files
+from bcrl.common import files
 from bcrl.report import cli, figures, style, verdicts
 from bcrl.report import statistics as st
 from bcrl.report.document import claims_report

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from bcrl.composed import CONF
+from bcrl.config.hydra_compose import CONF
 
 ROOT = Path(__file__).parent.parent
 FAST = ("scale=smoke", "algorithm/regressor=tabular", "progress=none")

@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from bcrl.pack import storable
-from bcrl.stage import Stage, Team
+from bcrl.common.serialization import storable
+from bcrl.learning.stage import SeedBatch, Stage
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def staged(learner, env, number=1, before=0):
 
 def team(*seeds):
     """Seeds that train together, with nothing to look at."""
-    return Team(seeds, np.zeros((1, 1)))
+    return SeedBatch(seeds, np.zeros((1, 1)))
 
 
 def last(moments):

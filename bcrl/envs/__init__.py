@@ -6,7 +6,7 @@ import importlib
 import pkgutil
 from collections.abc import Sequence
 
-from bcrl import trust
+from bcrl.common import plugins
 from bcrl.envs import _protocol
 from bcrl.envs._success import Success
 from bcrl.envs.base import Env, FiniteEnv, is_finite, is_simulated, lanes_of
@@ -25,10 +25,14 @@ __all__ = [
 ]
 
 
+#: Modules of this package that are no environments.
+PARTS = ("base", "gym_api", "rendering", "tasks")
+
+
 def env_names() -> list[str]:
     """Names of the environments that this package ships."""
     found = (module.name for module in pkgutil.iter_modules(__path__))
-    return [name for name in found if name != "base" and not name.startswith("_")]
+    return [name for name in found if name not in PARTS and name[0] != "_"]
 
 
 def check_tasks(name: str, tasks: Sequence[Env]) -> None:
@@ -57,8 +61,8 @@ def env_class(name: str) -> type:
 
     Others are modules of the user's own, as BCRL_TRUST allows.
     """
-    if trust.is_foreign(name, env_names()):
-        return trust.component("env.name", name, f"{name}.ENV")
+    if plugins.is_foreign(name, env_names()):
+        return plugins.component("env.name", name, f"{name}.ENV")
     if name not in env_names():
         raise BcrlError(f"env.name={name}: {did_you_mean(name, env_names())}")
     return importlib.import_module(f"bcrl.envs.{name}").ENV

@@ -15,9 +15,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from bcrl.common.signals import Interrupted
 from bcrl.envs._success import KEYS
 from bcrl.errors import BcrlError
-from bcrl.interrupts import Interrupted
 
 if TYPE_CHECKING:
     from bcrl.envs.gymnasium import Gymnasium

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.common.serialization import DERIVED, storable
 from bcrl.envs._contract import LARGEST, Broken, Simulator
-from bcrl.pack import DERIVED, storable
 
 if TYPE_CHECKING:
     from bcrl.envs.gymnasium import Gymnasium

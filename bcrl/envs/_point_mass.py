@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numba
 
-from bcrl.arrays import per_lane
+from bcrl.common.arrays import per_lane
 
 DT = 0.05  # s, Euler step
 NOISE = 1e-5  # standard deviation of the noise on each component of the derivative

@@ -18,7 +18,7 @@ from gymnasium.envs.registration import (
     parse_env_id,
 )
 
-from bcrl import trust
+from bcrl.common import plugins
 from bcrl.errors import ConfigError, did_you_mean, guess
 
 #: Gymnasium's wrappers that keep nothing beyond an episode and write nothing.
@@ -61,7 +61,7 @@ def spec_of(name: str) -> EnvSpec:
         if module in PACKAGES and not importlib.util.find_spec(module):
             why = f"isn't installed: pip install {PACKAGES[module][0]}"
             raise ConfigError("env.id", name, f"the package {module} {why}")
-        trust.module("env.id", name, module, PACKAGES)
+        plugins.module("env.id", name, module, PACKAGES)
     if name_there not in gymnasium.registry:
         raise ConfigError("env.id", name, _meant(name_there))
     return gymnasium.registry[name_there]
@@ -206,7 +206,7 @@ def _wrapped(env: gymnasium.Env, wrapper: Any) -> gymnasium.Env:
     name = wrapper["name"].removeprefix("gymnasium.wrappers.")
     if "." in name:
         foreign = PACKAGES.keys() - {"bcrl", "gymnasium"}
-        cls = trust.attribute("env.wrappers", name, name, foreign)
+        cls = plugins.attribute("env.wrappers", name, name, foreign)
         if not (isinstance(cls, type) and issubclass(cls, gymnasium.Wrapper)):
             raise ConfigError("env.wrappers", name, "must be a gymnasium.Wrapper")
     elif name in WRAPPERS and hasattr(gymnasium.wrappers, name):

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.common.terminal import say
 from bcrl.envs._lanes import SimulatedLanes
 from bcrl.errors import BcrlError
-from bcrl.terminal import say
 
 if TYPE_CHECKING:
     from bcrl.envs.gymnasium import Gymnasium

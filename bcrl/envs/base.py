@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.common.serialization import storable
 from bcrl.errors import ConfigError
-from bcrl.pack import storable
 
 Step = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.compiling import kept
+from bcrl.common.compiling import kept
 from bcrl.envs.base import Step, check_episodes
 from bcrl.errors import ConfigError
 

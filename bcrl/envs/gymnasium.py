@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bcrl import trust
+from bcrl.common import plugins
 from bcrl.envs import _simulators as simulators
 from bcrl.envs._contract import Simulator, plain_parts
 from bcrl.envs._lanes import SimulatedLanes
@@ -181,7 +181,7 @@ class Gymnasium:
     def map(self) -> Any:
         """The function `observation`."""
         name = str(self.observation)
-        return trust.attribute("env.observation", name, name)
+        return plugins.attribute("env.observation", name, name)
 
     def initial(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
         """What lanes are reset by: the noise (…, 1) itself."""

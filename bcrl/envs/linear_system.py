@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.arrays import like, namespace, ndtri
+from bcrl.common.arrays import like, namespace, ndtri
 from bcrl.envs import _point_mass as point_mass
 from bcrl.envs._point_mass import ACTION_COST, DT, GOAL_RADIUS, PATHWAY, START
 from bcrl.envs.base import Step, check_episodes

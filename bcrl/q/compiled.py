@@ -12,8 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
-from bcrl.compiling import kept
-from bcrl.q import descend, fused, grow, kernel, lanes, rows, tiles
+from bcrl.common.compiling import kept
+from bcrl.q.forest import descend, grow, kernel, lanes, rows
+from bcrl.q.networks import cpu, tiles
 
 
 def _fingerprint(*modules: ModuleType) -> int:
@@ -44,20 +45,20 @@ def _networks(fingerprint: int) -> tuple[Callable, Callable, Callable]:
     @_compiled
     def outputs(*given):
         _ = fingerprint
-        return fused.outputs(*given)
+        return cpu.outputs(*given)
 
     @_compiled
     def renew_ahead(*given):
         _ = fingerprint
-        return fused.renew_ahead(*given)
+        return cpu.renew_ahead(*given)
 
     @_compiled
     def update(*given):
         _ = fingerprint
-        return fused.update(*given)
+        return cpu.update(*given)
 
     return outputs, renew_ahead, update
 
 
 grow_forest, predict_forest = _forest(_fingerprint(lanes, kernel, rows, grow, descend))
-outputs, renew_ahead, update = _networks(_fingerprint(lanes, tiles, fused))
+outputs, renew_ahead, update = _networks(_fingerprint(lanes, tiles, cpu))

@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.arrays import per_lane
-from bcrl.pack import storable
-from bcrl.q import Values, check_width
+from bcrl.common.arrays import per_lane
+from bcrl.common.serialization import storable
+from bcrl.q.functions import Values, check_width
 
 #: products: all z_i z_j, i ≤ j [released]; linear_quadratic: the z_i besides [paper].
 FEATURES = ("products", "linear_quadratic")

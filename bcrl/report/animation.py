@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from bcrl.drawing import draw, frames_per_second
+from bcrl.common.files import write_atomically
 from bcrl.envs import Env, is_simulated
+from bcrl.envs.rendering import draw, frames_per_second
+from bcrl.envs.tasks import tasks_of
 from bcrl.errors import BcrlError, did_you_mean
-from bcrl.files import write_atomically
 from bcrl.report.findings import unreadable
 from bcrl.report.variants import Runs, Variant
-from bcrl.tasks import tasks_of
 
 COLOURS = 64  # of a GIF's palette
 PAUSE = 1500  # ms that the last frame stands

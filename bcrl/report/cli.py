@@ -10,8 +10,9 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.figure import Figure
 
+from bcrl.common.files import make_directory, write_text
+from bcrl.common.terminal import ready, say, show
 from bcrl.errors import BcrlError
-from bcrl.files import make_directory, write_text
 from bcrl.report import style
 from bcrl.report.animation import animations, gif_of
 from bcrl.report.arguments import Parser
@@ -26,7 +27,6 @@ from bcrl.report.page import Picture, Pictures, page
 from bcrl.report.sweeps import groups, sweep_report, sweep_table
 from bcrl.report.tables import aggregate
 from bcrl.report.variants import Runs
-from bcrl.terminal import ready, say, show
 
 #: figure → environment, experiment that makes its runs, method it cannot do without
 FIGURES: dict[str, tuple[str, str, str | None, Callable[..., Figure]]] = {

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.colors import to_hex, to_rgb
 from numpy.typing import NDArray
 
-from bcrl.divergence import diverging
+from bcrl.common.divergence import diverging
 from bcrl.report import style
 from bcrl.report.curves import LINEAR, figure_methods
 from bcrl.report.figures import optimum_of

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bcrl.divergence import diverging
+from bcrl.common.divergence import diverging
 from bcrl.report import style
 from bcrl.report.notes import remarks, tags_shown
 from bcrl.report.statistics import mean, standard_error

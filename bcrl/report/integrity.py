@@ -14,8 +14,8 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from bcrl.files import seed_path
-from bcrl.identity import differences, identity
+from bcrl.common.files import seed_path
+from bcrl.common.identity import differences, identity
 from bcrl.report.findings import AGAIN, INCOMPLETE, Finding, Refused
 from bcrl.report.notes import listed, ranges
 from bcrl.report.seedfiles import (

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bcrl.divergence import diverging
+from bcrl.common.divergence import diverging
 from bcrl.report import style
 from bcrl.report.figures import small_print
 from bcrl.report.statistics import bootstrap_curves, mean

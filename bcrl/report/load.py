@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bcrl.divergence import diverging
+from bcrl.common.divergence import diverging
 from bcrl.errors import BcrlError
 from bcrl.report.findings import BROKEN, INCOMPLETE, Finding
 from bcrl.report.integrity import Checked, check_tree

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from datetime import UTC, datetime
 from typing import Any
 
-from bcrl.identity import differences, flat, identity
+from bcrl.common.identity import differences, flat, identity
 from bcrl.report.document import duration
 from bcrl.report.figures import env_title
 from bcrl.report.notes import ranges

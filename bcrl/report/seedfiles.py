@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bcrl.files import is_intact, sha256
+from bcrl.common.files import is_intact, sha256
 from bcrl.report.findings import AGAIN, unreadable
 
 SCHEMA = 2  # of the records that this report reads

@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from bcrl import __version__
-from bcrl.files import write_atomically
+from bcrl.common.files import write_atomically
 from bcrl.report.variants import Variant
 
 #: One colour per way of transfer, in every figure and for FQI and DQN alike: Okabe and

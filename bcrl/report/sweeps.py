@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bcrl.identity import OUTPUT_KEYS
+from bcrl.common.identity import OUTPUT_KEYS
 from bcrl.report.curves import WINDOW, last, late
 from bcrl.report.linear_claims import seeds_cell
 from bcrl.report.notes import ranges

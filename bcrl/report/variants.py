@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.files import seed_path
+from bcrl.common.files import seed_path
 from bcrl.report.notes import Note
 from bcrl.report.seedfiles import read_arrays
 

@@ -7,11 +7,11 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from bcrl.common.terminal import ready, say, show
 from bcrl.errors import BcrlError
 from bcrl.report.arguments import Parser
 from bcrl.report.findings import BROKEN
 from bcrl.report.integrity import check_tree
-from bcrl.terminal import ready, say, show
 
 
 def parser() -> Parser:

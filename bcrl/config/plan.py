@@ -1,0 +1,215 @@
+"""From a composed configuration to a plan: stages, transfers, variant, directory."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bcrl.common import compiling
+from bcrl.common.checks import construct, one_of
+from bcrl.common.identity import Plain, differences
+from bcrl.config.algorithms import algorithm
+from bcrl.config.safety import check_name
+from bcrl.config.schema import Choice, Config
+from bcrl.config.variant import Composition, composition
+from bcrl.envs import Env, check_tasks
+from bcrl.envs.tasks import tasks_of
+from bcrl.errors import ConfigError, at_least, did_you_mean
+from bcrl.evaluation import metrics as probes
+from bcrl.learning.stage import Stage
+from bcrl.learning.transfer import PolicyReuse, ResidualPolicy, Shape
+from bcrl.results.loggers import logger
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything a run needs, checked; holds no Hydra object."""
+
+    env: str  # the choice's name, "maze"; several may use one environment
+    variant: str  # "BC-FQI"
+    tag: str | None
+    family: str  # how it is measured: "FQI" by iterations, "DQN" by steps
+    stages: tuple[Stage, ...]
+    tasks: tuple[Env, ...]  # easiest first, the target last
+    metrics: tuple[str, ...]
+    asked: tuple[int, ...]  # all seeds, of which these may be a part:
+    seeds: tuple[int, ...]
+    lockstep: int
+    device: str
+    config: Plain  # resolved, whole
+    command: str = ""  # what runs this plan alone, a line each if there are several
+
+    @property
+    def target(self) -> Env:
+        """The task that is to be solved in the end."""
+        return self.tasks[-1]
+
+    @property
+    def name(self) -> str:
+        """The directory's name, `<variant>` or `<variant>@<tag>`."""
+        return f"{self.variant}@{self.tag}" if self.tag else self.variant
+
+    @property
+    def root(self) -> Path:
+        """The folder of all results."""
+        return Path(self.config["runs_dir"])
+
+    @property
+    def directory(self) -> Path:
+        """Where this run's results go."""
+        return self.root / self.config["scale"]["name"] / self.env / self.name
+
+    @property
+    def length(self) -> int:
+        """Iterations or environment steps of all stages."""
+        return sum(stage.learner.length for stage in self.stages)
+
+
+def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
+    """The checked plan of a resolved config; ConfigError says what can't be.
+
+    `known` maps a tag to the config of the same choice of groups without any value
+    overridden: None to the paper's reading, "released" to the authors' code's. Where
+    the config departs from all of them, its results get a directory of their own, below
+    the name of the `env` choice.
+    """
+    compiling.check()
+    _check_outputs(config)
+    check_name("env", env)
+    tasks, metrics = _tasks(config["env"])
+    section = config["algorithm"]
+    if not isinstance(section, dict):
+        raise ConfigError("algorithm", section, "must be a section with a name")
+    name = section.get("name")
+    chosen_algorithm = algorithm(name)
+    chosen = composition(config, tasks)
+    stages = chosen_algorithm.stages(section, chosen)
+    chosen.check()  # an algorithm of the user's may have left it out
+    differing = {tag: differences(config, other) for tag, other in known.items()}
+    same = [tag for tag, changed in differing.items() if not changed]
+    tag = same[0] if same else _short_hash(differing[None])
+    lockstep = config["seeds"]["lockstep"]
+    asked = _asked(config["seeds"])
+    return Plan(
+        env=env,
+        variant=_variant(name, chosen),
+        tag=config["tag"] or tag,
+        family=chosen_algorithm.FAMILY,
+        stages=stages,
+        tasks=tuple(tasks),
+        metrics=metrics,
+        asked=asked,
+        seeds=part(asked, config["seeds"]["part"]),
+        lockstep=lockstep or chosen_algorithm.LOCKSTEP,
+        device=_device(config["device"], chosen_algorithm.FAMILY),
+        config=config,
+    )
+
+
+def _asked(section: Plain) -> tuple[int, ...]:
+    """All seeds: so many from the first on, or those that are listed."""
+    first, count, listed = (section.get(key) for key in ("first", "count", "only"))
+    if count is not None:
+        return tuple(range(first, first + count))
+    if not listed or len(set(listed)) < len(listed):
+        raise ConfigError("seeds.only", listed, "must be different seeds: seeds=[3,7]")
+    for seed in listed:
+        at_least("seeds.only", seed, 0)
+    return tuple(sorted(listed))
+
+
+def part(seeds: tuple[int, ...], which: str | None) -> tuple[int, ...]:
+    """The part of the seeds that `which` names, "2/5"; all of them if it is None."""
+    if which is None:
+        return seeds
+    found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", which, re.ASCII)
+    number, parts = map(int, found.groups()) if found else (0, 0)
+    if not 1 <= number <= parts <= len(seeds):
+        why = f"must be K/N, the K-th of at most {len(seeds)} parts, such as 1/2"
+        raise ConfigError("seeds.part", which, why)
+    first, after = ((k * len(seeds)) // parts for k in (number - 1, number))
+    return seeds[first:after]
+
+
+def _variant(algorithm_name: str, chosen: Composition) -> str:
+    """`SBC-DQN` and the like; policy reuse and residual policy by their own names."""
+    prefix = "S" * isinstance(chosen.transfer, Shape)
+    prefix += "B" * (chosen.boost is not None) + "C" * (not chosen.target_only)
+    name = algorithm_name.rpartition(".")[2].upper()
+    whole = f"{prefix}-{name}" if prefix else name
+    if isinstance(chosen.transfer, ResidualPolicy):
+        return "RPL"
+    if isinstance(chosen.transfer, PolicyReuse):
+        return f"PPR-{whole}" if chosen.boost else "PPR"
+    if chosen.transfer is None or isinstance(chosen.transfer, Shape):
+        return whole
+    return f"{type(chosen.transfer).__name__}-{whole}"  # the user's own
+
+
+def _device(wanted: str, family: str) -> str:
+    """`cpu` or `cuda`; ConfigError if there is no such device."""
+    one_of("device", wanted, ["cpu", "cuda", "auto"])
+    if family != "DQN" or wanted == "cpu":
+        return "cpu"  # forests grow on the CPU
+    import torch
+
+    there = torch.cuda.is_available()
+    if wanted == "cuda" and not there:
+        raise ConfigError("device", "cuda", "torch finds no CUDA device; device=cpu")
+    return "cuda" if there else "cpu"
+
+
+def _short_hash(changed: Mapping[str, tuple[Any, Any]]) -> str:
+    values = {key: value for key, (value, _) in changed.items()}
+    text = json.dumps(values, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def _check_outputs(config: Plain) -> None:
+    seeds, scale = config["seeds"], config["scale"]
+    known = [f.name for f in dataclasses.fields(Config)]
+    for key, value in config.items():
+        if key not in known:
+            raise ConfigError(key, value, f"unknown key; {did_you_mean(key, known)}")
+    construct("curriculum", Choice, config["curriculum"])
+    at_least("seeds.first", seeds["first"], 0)
+    at_least("seeds.count", seeds["count"], 1)
+    at_least("seeds.lockstep", seeds["lockstep"], 1)
+    at_least("workers", config["workers"], 1)
+    at_least("threads", config["threads"], 1)
+    at_least("scale.max_iterations", scale["max_iterations"], 1)
+    at_least("scale.max_episodes", scale["max_episodes"], 1)
+    at_least("scale.max_steps", scale["max_steps"], 1)
+    if not config["checkpoint_every"] > 0 or config["checkpoint_every"] == math.inf:
+        why = "must be a number of seconds above 0"
+        raise ConfigError("checkpoint_every", config["checkpoint_every"], why)
+    logger(config["logger"])
+    one_of("progress", config["progress"], ["auto", "bar", "lines", "none"])
+    for key, value in (("tag", config["tag"]), ("scale.name", scale["name"])):
+        if value is not None:
+            check_name(key, value)
+    for key, value, most in (
+        ("seeds.first", seeds["first"], 2**32),
+        ("seeds.count", seeds["count"] or len(seeds["only"] or ()), 10**6),
+        ("seeds.only", max(seeds["only"] or (0,)), 2**32),
+    ):
+        if value > most:
+            raise ConfigError(key, value, f"must be at most {most}")
+
+
+def _tasks(section: Plain) -> tuple[list[Env], tuple[str, ...]]:
+    """The environment's tasks, easiest first, and the metrics to record."""
+    tasks = tasks_of(section)
+    check_tasks(section["name"], tasks)
+    metrics = section.get("metrics")
+    if not isinstance(metrics, list) or not metrics:
+        raise ConfigError("env.metrics", metrics, "must be a list of metric names")
+    probes.check(metrics, tasks[-1])
+    return tasks, tuple(metrics)

@@ -1,0 +1,225 @@
+"""The rule book: which learners, tasks and transfers make a course of stages.
+
+The command line and `bcrl.api` both make their stages here, so what one of them makes
+or rejects, the other does, too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from itertools import pairwise
+from numbers import Integral, Real
+from typing import TypeVar
+
+from bcrl.common.checks import one_of
+from bcrl.config.variant import Composition
+from bcrl.envs import Env, is_finite
+from bcrl.errors import ConfigError
+from bcrl.learning.dqn import DQN
+from bcrl.learning.fqi import FQI
+from bcrl.learning.lspi import LSPI
+from bcrl.learning.stage import Learner, Stage
+from bcrl.learning.transfer import Boost, Shape, StageInit, warm_start
+from bcrl.q.functions import ZERO
+from bcrl.q.quadratic import FEATURES
+
+#: A setting's type, its least value and, where there is one, its greatest.
+BOUNDS = {
+    "iterations": (int, 1),
+    "episodes": (int, 1),
+    "steps": (int, 1),
+    "random_steps": (int, 0),
+    "learning_starts": (int, 0),
+    "epsilon": (float, 0, 1),
+    "epsilon_start": (float, 0, 1),
+    "anneal_steps": (int, 0),
+    "target_update": (int, 1),
+    "batch_size": (int, 1),
+    "evaluate_every": (int, 1),
+    "evaluation_episodes": (int, 1),
+    "evaluation_epsilon": (float, 0, 1),
+}
+#: What a warm start passes on besides values, so that it can't differ between slots.
+PASSED_ON = {FQI: ("regressor",), DQN: ("hidden", "learning_rate")}
+T = TypeVar("T", FQI, DQN)
+
+
+def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...]:
+    """The stages of a composition, given the learner of each slot.
+
+    One stage per slot. Plain DQN has one in all, with the steps of all slots and the
+    other settings of the last: its networks, task and replay stay the same. Raises
+    ConfigError for what can't be learned, or would have no effect.
+    """
+    _check(chosen, learners)
+    chosen.check()
+    slots = list(zip(chosen.order, learners, strict=True))
+    last = learners[-1]
+    warm = chosen.transfers == (warm_start,)
+    if warm and chosen.target_only and all(isinstance(x, DQN) for x in learners):
+        steps = sum(learner.steps for learner in learners)
+        slots = [(chosen.order[-1], replace(last, steps=steps))]
+    made: list[Stage] = []
+    for number, (task, learner) in enumerate(slots, start=1):
+        env = chosen.tasks[task]
+        if isinstance(learner, FQI) and not learner.new_data:
+            learner = _with_data(learner, env, made)
+        # Whoever starts without a policy fills the replay at random.
+        if isinstance(learner, DQN) and made and _knows_a_policy(chosen.start):
+            learner = replace(learner, random_steps=0)
+        made.append(Stage(number, task + 1, env, learner, chosen.transfers, 0))
+    return _placed(made)
+
+
+def capped(
+    stages: Sequence[Stage], kind: type[T], **most: int | None
+) -> tuple[Stage, ...]:
+    """The stages with a scale's caps on the budgets of one kind of learner."""
+    made = []
+    for stage in stages:
+        learner = stage.learner
+        if isinstance(learner, kind):
+            caps = {k: min(getattr(learner, k), cap) for k, cap in most.items() if cap}
+            learner = replace(learner, **caps)
+        made.append(replace(stage, learner=learner))
+    return _placed(made)
+
+
+def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
+    """Raise ConfigError for learners that don't suit the slots, or each other."""
+    n, start = len(chosen.order), chosen.start or StageInit()
+    if n == 1 and not start.behavior:
+        chosen.check()
+    if len(learners) != n:
+        why = f"there are {len(learners)} learners for {n} slots"
+        raise ConfigError("algorithm.learners", list(learners), why)
+    for slot, learner in enumerate(learners):
+        if not hasattr(learner, "learn") or isinstance(learner, type):
+            why = "is no learner: an object with settings and `learn`, such as DQN()"
+            raise ConfigError("algorithm.learners", learner, why)
+        if isinstance(learner, FQI) != isinstance(learners[-1], FQI):
+            why = "a course has learners of one family, FQI or DQN"
+            raise ConfigError("algorithm.learners", learner, why)
+        if isinstance(learner, FQI):
+            _check_fqi(chosen, learner, chosen.slots[slot], start)
+        elif isinstance(learner, DQN):
+            _check_dqn(chosen, learner, start)
+        elif isinstance(learner, LSPI):
+            _check_lspi(chosen, slot, learner, start)
+    for one, other in pairwise(learners):
+        for name in PASSED_ON.get(type(other), ()) if start.initial is not ZERO else ():
+            here, there = getattr(one, name, None), getattr(other, name)
+            if here != there:
+                why = f"was {here} in the slot before; a warm start keeps it"
+                raise ConfigError(f"algorithm.{name}", there, why)
+
+
+def _check_fqi(chosen: Composition, learner: FQI, env: Env, start: StageInit) -> None:
+    _check_numbers("algorithm", learner)
+    key, regressor = "algorithm.regressor", learner.regressor
+    if isinstance(regressor, type) or not hasattr(regressor, "fit"):
+        raise ConfigError(key, regressor, "is no regressor")
+    if not hasattr(regressor, "finite_only"):
+        why = "is no regressor of bcrl's; Sklearn(estimator) makes one of it"
+        raise ConfigError(key, regressor, why)
+    if regressor.finite_only and not is_finite(env):
+        why = f"needs finitely many states, which {env.name} has not"
+        raise chosen.refusal(key, regressor, why)
+    if learner.shared_data and learner.epsilon < 1:
+        why = "seeds can share data only if all are random: algorithm.epsilon must be 1"
+        raise ConfigError("algorithm.dataset", "shared", why)
+    if start.behavior is not None:
+        why = "steers step by step, FQI learns from whole episodes; use algorithm=dqn"
+        raise chosen.refusal("transfer", chosen.transfer, why)
+    if start.boost != Boost():
+        why = "is the released DQN's reading; FQI knows the paper's, boosting=on"
+        key = "boosting" if chosen.boost else "transfer"
+        raise chosen.refusal(key, chosen.boost or chosen.transfer, why)
+    if start.shape not in (None, Shape()):
+        why = "is the released DQN's reading; FQI knows transfer=shaping"
+        raise chosen.refusal("transfer", chosen.transfer, why)
+
+
+def _check_dqn(chosen: Composition, learner: DQN, start: StageInit) -> None:
+    _check_numbers("algorithm", learner)
+    size, begins = learner.replay_size, learner.learning_starts
+    if not isinstance(size, Integral) or size < learner.batch_size:
+        why = f"holds less than a batch, batch_size={learner.batch_size}"
+        raise ConfigError("algorithm.replay_size", size, why)
+    if size <= begins:
+        why = f"never holds more than learning_starts={begins}, so nothing is learned"
+        raise ConfigError("algorithm.replay_size", size, why)
+    if not 0 < learner.learning_rate < math.inf:
+        why = "must be a number above 0"
+        raise ConfigError("algorithm.learning_rate", learner.learning_rate, why)
+    widths = learner.hidden
+    whole = all(isinstance(w, Integral) and w >= 1 for w in widths)
+    if not widths or not whole:
+        why = "must be a list of layer widths, each at least 1"
+        raise ConfigError("algorithm.hidden", list(widths), why)
+    if start.initial is not ZERO and chosen.transfers != (warm_start,):
+        why = "sets `initial`, but DQN starts from networks: set `base`, `potential` "
+        raise chosen.refusal("transfer", chosen.transfer, why + "or `prior`")
+
+
+def _check_lspi(
+    chosen: Composition, slot: int, learner: LSPI, start: StageInit
+) -> None:
+    env = chosen.slots[slot]
+    why = ""
+    if getattr(env, "linear_quadratic", None) is None or not hasattr(env, "push"):
+        why = "learns quadratic Q-functions of continuous actions, but "
+        why += f"{env} is no linear-quadratic task"
+    elif start.initial is not ZERO:
+        why = "leaves no network to start DQN's from: boosting=on or a transfer needed"
+    elif slot:
+        why = f"starts from nothing, so slot {slot + 1} would drop what the one before "
+        why += "has learned: LSPI in the first slot, DQN in the others"
+    if why:
+        raise ConfigError("algorithm.learners", learner.name, why)
+    _check_numbers("algorithm.lspi", learner)
+    one_of("algorithm.lspi.features", learner.features, FEATURES)
+    if not 0 < learner.noise_std < math.inf:
+        why = "must be above 0: without noise LSTDQ sees one action per state"
+        raise ConfigError("algorithm.lspi.noise_std", learner.noise_std, why)
+    learner.episodes_per_iteration(env)  # says whether they are whole
+
+
+def _check_numbers(section: str, learner: FQI | DQN | LSPI) -> None:
+    for name in (f.name for f in fields(learner) if f.name in BOUNDS):
+        (kind, least, *most), value = BOUNDS[name], getattr(learner, name)
+        fits = isinstance(value, Integral if kind is int else Real)
+        fits = fits and not isinstance(value, bool) and least <= value
+        if not fits or value > max(most, default=math.inf):
+            noun = "an integer" if kind is int else "a number"
+            bounds = f"from {least} to {most[0]}" if most else f"of at least {least}"
+            raise ConfigError(f"{section}.{name}", value, f"must be {noun} {bounds}")
+
+
+def _with_data(learner: FQI, env: Env, before: Sequence[Stage]) -> FQI:
+    """With new data unless the stage before had this task, whose data are kept then."""
+    if not before or before[-1].env != env:
+        return replace(learner, new_data=True)
+    kept = before[-1].learner
+    if (learner.epsilon, learner.episodes) != (kept.epsilon, kept.episodes):
+        why = "the task's data are kept, so epsilon and episodes must stay the same"
+        raise ConfigError("algorithm.new_data", "task", why)
+    return learner
+
+
+def _knows_a_policy(start: StageInit | None) -> bool:
+    """Whether a stage has a policy from the start: shaping alone gives none."""
+    return start is None or any(
+        q is not ZERO for q in (start.base, start.initial, start.prior)
+    )
+
+
+def _placed(stages: Sequence[Stage]) -> tuple[Stage, ...]:
+    """Stages whose `before` counts what the ones before them take."""
+    done, out = 0, []
+    for stage in stages:
+        out.append(replace(stage, before=done))
+        done += stage.learner.length
+    return tuple(out)

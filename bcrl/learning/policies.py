@@ -1,0 +1,100 @@
+"""Policies as pure functions of action values and uniform draws."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from bcrl.common.arrays import per_lane
+from bcrl.common.compiling import kept
+
+TIE = 1e-9  # distances between actions that differ by less are equal
+
+
+@numba.njit
+def _best(q, u):
+    """The greatest of q (A,), ties broken by u in [0, 1); 0 where NaN hides it."""
+    best, ties = q[0], 1
+    for a in range(1, len(q)):
+        if q[a] > best:
+            best, ties = q[a], 1
+        elif q[a] == best:
+            ties += 1
+    rank = int(u * ties)
+    for a in range(len(q)):
+        if q[a] == best:
+            if rank == 0:
+                return a
+            rank -= 1
+    return 0
+
+
+@per_lane("(f8[:], f8, i8[:])", "(a),()->()")
+def greedy(q, u, action):
+    """The best action of q (..., A); ties are broken uniformly by u (...) in [0, 1)."""
+    action[0] = _best(q, u)
+
+
+@per_lane("(f8[:], f8, f8, f8, i8[:], b1[:])", "(a),(),(),()->(),()")
+def epsilon_greedy(q, explore, u, epsilon, action, random):
+    """`greedy`, or `uniform` where `explore` (...) is below ε; and where that is so."""
+    random[0] = explore < epsilon
+    action[0] = int(u * len(q)) if random[0] else _best(q, u)
+
+
+def uniform(n_actions: int, u: NDArray[np.float64]) -> NDArray[np.intp]:
+    """A uniformly random action from each u (...) in [0, 1)."""
+    return (u * n_actions).astype(np.intp)
+
+
+def annealed(step: int, first: float, last: float, over: int) -> float:
+    """ε at a step, falling in a straight line from `first` to `last` over `over`."""
+    return last if step >= over else first + (last - first) * step / over
+
+
+def combined(actions: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Residual policy's table (A, A): what is done for (prior's action, own action).
+
+    The action of `actions` (A, k) nearest to their sum; the own one if they cancel,
+    and among equally near ones the one nearest to the own (paper, C.3).
+    """
+    aim = actions[:, None] + actions[None]
+    off = np.linalg.norm(aim[:, :, None] - actions, axis=-1)
+    from_own = np.linalg.norm(actions[:, None] - actions, axis=-1)
+    near = off <= off.min(-1, keepdims=True) + TIE
+    table = np.where(near, from_own[None], np.inf).argmin(-1)
+    own = np.broadcast_to(np.arange(len(actions)), table.shape)
+    return np.where(np.linalg.norm(aim, axis=-1) < TIE, own, table)
+
+
+@kept(nogil=True)
+def walk(next_row, reward, absorbing, q, first, u, epsilon):
+    """One seed's ε-greedy episodes in a finite task, row by row from `first` (E,).
+
+    next_row, reward, absorbing, q: tables (N, A); u: uniforms (T, E, 2 or more).
+    Returns rows (E, T + 1), actions (E, T) and lengths (E,). It stands beside `_best`
+    because numba's cache of a file doesn't see changes of another.
+    """
+    horizon, episodes = u.shape[0], u.shape[1]
+    n_actions = q.shape[1]
+    row = np.empty((episodes, horizon + 1), np.intp)
+    action = np.zeros((episodes, horizon), np.intp)
+    length = np.zeros(episodes, np.intp)
+    for e in range(episodes):
+        at = first[e]
+        row[e, 0] = at
+        for t in range(horizon):
+            if u[t, e, 0] < epsilon:
+                act = int(u[t, e, 1] * n_actions)
+            else:
+                act = _best(q[at], u[t, e, 1])
+            action[e, t] = act
+            length[e] = t + 1
+            done = absorbing[at, act]
+            at = next_row[at, act]
+            row[e, t + 1] = at
+            if done:
+                break
+        row[e, length[e] + 1 :] = at
+    return row, action, length

@@ -1,0 +1,268 @@
+"""DQN's update and forward pass compiled, a seed at a time: the CPU's way.
+
+Computes what `mlp` and `DQN`'s torch update compute with batched products, but
+one seed's parameters stay in the cache from the batch to Adam, no cost is paid by the
+call, and units that are off for a whole batch are left out of the products
+(`tiles`). A seed's floats don't depend on the others. A transition's bootstrap
+value is kept until the target network changes, so that a batch asks the target only
+about transitions not drawn since.
+
+A layer's parameters, weights (in, out) and then biases, are one matrix (in + 1, out):
+the input of a layer has a row of ones. `bcrl.q.compiled` has the entry points.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from bcrl.q.networks import tiles
+from bcrl.q.networks.tiles import LANES, WIDTH, padded
+
+TOGETHER = 64  # rows that the target is asked about at a time, ahead of their use
+_compiled = numba.njit(nogil=True, error_model="numpy")
+
+
+class Room(NamedTuple):
+    """What passes of up to n inputs write, in a network of widths n_0 … n_L.
+
+    Arrays are somewhat larger than said, for the last tiles of rows and columns.
+    """
+
+    units: NDArray[np.float32]  # (L + 1, widest + 1, n): inputs, activations, outputs
+    slopes: NDArray[np.float32]  # the same of ∂loss/∂(what a ReLU is given)
+    turned: NDArray[np.float32]  # (n, widest): one layer's slopes, transposed
+    alive: NDArray[np.int64]  # (L, widest + 1): units on in some column, then the ones
+    dead: NDArray[np.int64]  # (L, widest + 1): the other units
+    n_alive: NDArray[np.int64]  # (L,): how many are on
+    some: NDArray[np.int32]  # (widest,): not 0 if the unit is on in some column
+    all: NDArray[np.int64]  # (widest or n,): all units of a layer, or columns
+
+
+@_compiled
+def space(sizes, n):
+    """Room for up to `n` inputs."""
+    layers, widest = len(sizes), sizes.max()
+    shape = (layers, padded(widest + 1, LANES), padded(n, WIDTH))
+    return Room(
+        np.zeros(shape, np.float32),
+        np.zeros(shape, np.float32),
+        np.zeros((padded(n, LANES), padded(widest, WIDTH)), np.float32),
+        np.zeros((layers, widest + 1), np.int64),
+        np.zeros((layers, widest + 1), np.int64),
+        np.zeros(layers, np.int64),
+        np.zeros(widest, np.int32),
+        np.arange(max(n, widest)),
+    )
+
+
+@_compiled
+def forward(flat, sizes, room, n):
+    """Outputs (n_out, n) of one seed's network at the n inputs in room.units[0]."""
+    at, last = 0, len(sizes) - 2
+    room.some[:] = 1
+    for layer in range(last + 1):
+        n_in, n_out = sizes[layer], sizes[layer + 1]
+        before, after = room.units[layer], room.units[layer + 1]
+        before[n_in] = np.float32(1.0)
+        alive, dead, m = room.alive[layer], room.dead[layer], 0
+        for k in range(n_in):  # it stays in one of the lists, the next takes the other
+            alive[m] = dead[k - m] = k
+            m += room.some[k] != 0
+        alive[m] = n_in
+        room.n_alive[layer] = m
+        shape = (n, room.all, n_out, alive, m + 1)
+        factors = (flat[at:], 1, n_out, before)
+        if layer < last:
+            room.some[:] = 0
+            tiles.product_relu((after, room.some), *shape, *factors)
+        else:
+            tiles.product((after,), *shape, *factors)
+        at += (n_in + 1) * n_out
+    return room.units[last + 1]
+
+
+@_compiled
+def backward(flat, first, second, sizes, room, n, constants):
+    """A step of Adam on one seed's network (P,), after `forward` at n inputs.
+
+    first, second (P,): moments; constants: what Adam's finish wants; room.turned holds
+    ∂loss/∂output, and so does the last of room.slopes.
+    """
+    at, last = len(flat), len(sizes) - 2
+    above, n_above = room.all, sizes[last + 1]
+    for layer in range(last, -1, -1):
+        n_in, n_out = sizes[layer], sizes[layer + 1]
+        end, at = at, at - (n_in + 1) * n_out
+        before, alive, m = room.units[layer], room.alive[layer], room.n_alive[layer]
+        slopes, below = room.slopes[layer + 1], room.slopes[layer]
+        weights = flat[at:end]
+        if layer:  # through the weights as they were in `forward`
+            factors = (weights, n_out, 1, slopes)
+            tiles.product((below,), n, alive, m, above, n_above, *factors)
+        shape = (n_in + 1, n_out)
+        moments = first[at:end].reshape(shape), second[at:end].reshape(shape)
+        to = (weights.reshape(shape), *moments, *constants)
+        factors = (before.reshape(-1), before.shape[1], 1, room.turned)
+        tiles.product_adam(to, n_out, alive, m + 1, room.all, n, *factors)
+        dead = room.dead[layer]
+        tiles.product_adam(to, n_out, dead, n_in - m, room.all, 0, *factors)
+        if layer:
+            for column in range(0, n, LANES):
+                for row in range(0, n_in, LANES):
+                    tiles.turn(below, before, room.turned, row, column)
+        above, n_above = alive, m
+
+
+@_compiled
+def row_times(row, weights, out):
+    """row (in,) · weights (in, out)."""
+    out[:] = np.float32(0.0)
+    for k in range(len(row)):
+        if row[k] != 0:  # as behind a ReLU that is off
+            for j in range(len(out)):
+                out[j] += row[k] * weights[k, j]
+
+
+@_compiled
+def ask(flat, sizes, state, row, out):
+    """Outputs of one seed's network at one state (d,), in `out`; `row` is overwritten.
+
+    Both as long as the widest layer and one. Too little for tiles.
+    """
+    at, last = 0, len(sizes) - 2
+    row[: sizes[0]] = state
+    for layer in range(last + 1):
+        n_in, n_out = sizes[layer], sizes[layer + 1]
+        end = at + (n_in + 1) * n_out
+        row[n_in] = np.float32(1.0)
+        row_times(row[: n_in + 1], flat[at:end].reshape(n_in + 1, n_out), out[:n_out])
+        if layer < last:
+            for j in range(n_out):
+                row[j] = max(out[j], np.float32(0.0))
+        at = end
+
+
+@_compiled
+def outputs(flat, sizes, x):
+    """Outputs (S, n, out) of S networks, parameters (S, P), at x (S, n, in)."""
+    n_seeds, n, d = x.shape
+    n_out = sizes[-1]
+    out = np.empty((n_seeds, n, n_out), np.float32)
+    room = space(sizes, n)
+    row = np.empty(sizes.max() + 1, np.float32)
+    values = np.empty_like(row)
+    for s in range(n_seeds):
+        if n == 1:
+            ask(flat[s], sizes, x[s, 0], row, values)
+            out[s, 0] = values[:n_out]
+            continue
+        for b in range(n):
+            for i in range(d):
+                room.units[0, i, b] = x[s, b, i]
+        found = forward(flat[s], sizes, room, n)
+        for b in range(n):
+            for a in range(n_out):
+                out[s, b, a] = found[a, b]
+    return out
+
+
+@_compiled
+def renew(target, sizes, rows, bootstrap, known, places, layout, stale, room):
+    """Make one seed's `bootstrap` max_a' (ϱ + base)(s') known at `places`.
+
+    rows, bootstrap, known: the seed's part of `Replay`'s; stale (n,) and room for as
+    many inputs are overwritten: up to n rows at a time are asked for.
+    """
+    d, n_actions = layout
+    n, last = 0, len(places) - 1
+    for i in range(len(places)):
+        place = places[i]
+        if not known[place]:
+            known[place] = True
+            for k in range(d):
+                room.units[0, k, n] = rows[place, d + k]
+            stale[n] = place
+            n += 1
+        if n == len(stale) or (i == last and n > 0):
+            values = forward(target, sizes, room, n)
+            for k in range(n):
+                row = rows[stale[k]]
+                best = values[0, k] + row[2 * d]
+                for a in range(1, n_actions):
+                    best = max(best, values[a, k] + row[2 * d + a])
+                bootstrap[stale[k]] = best
+            n = 0
+
+
+@_compiled
+def renew_ahead(target, sizes, rows, bootstrap, known, held, places, layout):
+    """`renew` for S seeds, at all `places` (T, S, B) of batches to come.
+
+    In large products, and with a target's parameters loaded once. What is not among the
+    first `held` rows yet is left out.
+    """
+    room, stale = space(sizes, TOGETHER), np.empty(TOGETHER, np.int64)
+    for s in range(len(target)):
+        there = places[:, s].copy().reshape(-1)
+        there = there[there < held]
+        seed = (rows[s], bootstrap[s], known[s])
+        renew(target[s], sizes, *seed, there, layout, stale, room)
+
+
+@_compiled
+def update(
+    online,
+    target,
+    moments,
+    sizes,
+    rows,
+    bootstrap,
+    known,
+    places,
+    layout,
+    constants,
+    states,
+    loss,
+    ahead,
+):
+    """One DQN update of S seeds, in place; each one's mean loss goes to `loss` (S,).
+
+    online, target (S, P); moments (2, S, P); rows (S, capacity, width), bootstrap and
+    known (S, capacity) of `Replay`; places (S, B) rows of each seed's own; layout: d
+    and A; constants: Adam's. While its parameters are in the cache, each network is
+    asked at the state that comes next, states (S, d): `ahead` (S, A).
+    """
+    d, n_actions = layout
+    beta1, beta2, rate, scale, eps = constants
+    adam = (beta1, 1.0 - beta1, beta2, 1.0 - beta2, rate, scale, eps)
+    n_seeds, n = places.shape
+    room, stale, one = space(sizes, n), np.empty(n, np.int64), np.float32(1.0)
+    row = np.empty(sizes.max() + 1, np.float32)
+    answer = np.empty_like(row)
+    slopes, end = room.slopes[len(sizes) - 1], 2 * d + n_actions
+    for s in range(n_seeds):
+        held, value, fresh, drawn = rows[s], bootstrap[s], known[s], places[s]
+        renew(target[s], sizes, held, value, fresh, drawn, layout, stale, room)
+        for b in range(n):
+            for i in range(d):
+                room.units[0, i, b] = held[drawn[b], i]
+        values = forward(online[s], sizes, room, n)
+        slopes[:n_actions] = np.float32(0.0)
+        room.turned[:, :n_actions] = np.float32(0.0)
+        total_loss = 0.0
+        for b in range(n):
+            packed = held[drawn[b]]
+            a = int(packed[end + 2])
+            y = packed[end] + packed[end + 1] * value[drawn[b]]
+            error = values[a, b] - y
+            clipped = one if error > one else -one if error < -one else error  # or nan
+            room.turned[b, a] = slopes[a, b] = clipped / np.float32(n)
+            total_loss += clipped * (error - np.float32(0.5) * clipped)
+        loss[s] = total_loss / n
+        backward(online[s], moments[0, s], moments[1, s], sizes, room, n, adam)
+        ask(online[s], sizes, states[s], row, answer)
+        ahead[s] = answer[:n_actions]

@@ -1,0 +1,194 @@
+"""Q-networks of S seeds side by side: stacked weights, batched products, Adam.
+
+What is here runs on any device. On a CPU `cpu` computes the same in compiled
+code; `DQN` and `DeepQ` choose.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from bcrl.common.serialization import DERIVED, storable
+from bcrl.q import compiled
+from bcrl.q.functions import Values, check_width, each
+from bcrl.q.networks.tiles import FADED
+
+Tensor = torch.Tensor
+
+
+def xavier(
+    rng: np.random.Generator, sizes: Sequence[int], gain: float = math.sqrt(2)
+) -> NDArray[np.float32]:
+    """One network's weights and biases as a flat vector (P,), layer after layer.
+
+    Weights (in, out) are Xavier-uniform with `gain` (1 in the last layer), biases
+    uniform on ±1/√in (Glorot and Bengio 2010; torch's default for biases).
+    """
+    parts = []
+    pairs = list(itertools.pairwise(sizes))
+    for layer, (n_in, n_out) in enumerate(pairs):
+        scale = gain if layer < len(pairs) - 1 else 1.0
+        limit = scale * math.sqrt(6.0 / (n_in + n_out))
+        parts.append(rng.uniform(-limit, limit, n_in * n_out))
+        parts.append(rng.uniform(-1.0, 1.0, n_out) / math.sqrt(n_in))
+    return np.concatenate(parts).astype(np.float32)
+
+
+@storable
+@dataclass(eq=False)
+class Networks:
+    """S perceptrons with ReLU, their parameters the rows of one buffer `flat` (S, P).
+
+    `sizes` are the widths (in, hidden …, out). Batches have shape (S, n, in); nothing
+    is shared between seeds, and no result depends on how many there are.
+    """
+
+    sizes: tuple[int, ...]
+    flat: Tensor
+    _buffers: dict[int, list[Tensor]] = field(
+        default_factory=dict, repr=False, metadata=DERIVED
+    )
+
+    def __post_init__(self) -> None:
+        self.layers = self._views(self.flat)
+
+    def _views(self, flat: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """(weights (S, in, out), biases (S, 1, out)) of each layer, inside `flat`."""
+        views, at = [], 0
+        for n_in, n_out in itertools.pairwise(self.sizes):
+            end = at + n_in * n_out
+            weights = flat[:, at:end].view(-1, n_in, n_out)
+            views.append((weights, flat[:, end : end + n_out].unsqueeze(1)))
+            at = end + n_out
+        return views
+
+    def clone(self) -> Networks:
+        """Networks with the same parameters in a buffer of their own."""
+        return Networks(self.sizes, self.flat.clone())
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Outputs (S, n, out), in a buffer that the next call with n overwrites."""
+        n = x.shape[1]
+        if n not in self._buffers:
+            widths = self.sizes[1:]
+            self._buffers[n] = [x.new_empty((x.shape[0], n, w)) for w in widths]
+        activations = self._buffers[n]
+        last = len(self.layers) - 1
+        for layer, (weights, biases) in enumerate(self.layers):
+            x = torch.baddbmm(biases, x, weights, out=activations[layer])
+            if layer < last:
+                x.relu_()
+        return x
+
+    def backward(self, x: Tensor, slope: Tensor, gradient: Networks) -> None:
+        """Write the parameters' gradients into `gradient`, given ∂loss/∂output.
+
+        `slope` (S, n, out) belongs to the latest `forward(x)`, x (S, n, in).
+        """
+        activations = self._buffers[x.shape[1]]
+        spare = gradient._buffers.setdefault(
+            x.shape[1], [torch.empty_like(a) for a in activations]
+        )
+        for layer in reversed(range(len(self.layers))):
+            before = activations[layer - 1] if layer else x
+            weights, biases = gradient.layers[layer]
+            torch.bmm(before.transpose(1, 2), slope, out=weights)
+            torch.sum(slope, 1, keepdim=True, out=biases)
+            if layer:
+                onward = self.layers[layer][0].transpose(1, 2)
+                slope = torch.bmm(slope, onward, out=spare[layer - 1])
+                _mask(slope, before)
+
+
+def _mask(slope: Tensor, activation: Tensor) -> None:
+    """Zero the slope where the ReLU was off, in place."""
+    torch.ops.aten.threshold_backward.grad_input(slope, activation, 0, grad_input=slope)
+
+
+@storable
+@dataclass(eq=False)
+class Adam:
+    """Adam on a flat buffer (S, P), every seed by itself (Kingma and Ba 2015)."""
+
+    moments: Tensor  # (2, S, P)
+    rate: float
+    betas: tuple[float, float] = (0.9, 0.999)
+    eps: float = 1e-8
+    steps: int = 0
+
+    @classmethod
+    def of(cls, parameters: Tensor, rate: float) -> Adam:
+        """For parameters (S, P) that have not been trained yet."""
+        return cls(parameters.new_zeros((2, *parameters.shape)), rate)
+
+    def clone(self) -> Adam:
+        """The same moments and step count in a buffer of their own."""
+        return replace(self, moments=self.moments.clone())
+
+    def next_step(self) -> tuple[float, float, float, float, float]:
+        """Count a step; β1, β2, the rate and scale that correct the bias, and ε."""
+        self.steps += 1
+        b1, b2 = self.betas
+        rate = self.rate / (1.0 - b1**self.steps)
+        scale = 1.0 / math.sqrt(1.0 - b2**self.steps)
+        return b1, b2, rate, scale, self.eps
+
+    def step(self, parameters: Tensor, gradient: Tensor) -> None:
+        """One update of `parameters` in place."""
+        b1, b2, rate, scale, eps = self.next_step()
+        first, second = self.moments
+        first.lerp_(gradient, 1.0 - b1)
+        second.mul_(b2).addcmul_(gradient, gradient, value=1.0 - b2)
+        first.masked_fill_(first.abs() < FADED, 0.0)
+        second.masked_fill_(second < FADED, 0.0)
+        parameters.addcdiv_(first, second.sqrt().mul_(scale).add_(eps), value=-rate)
+
+
+@storable
+@dataclass
+class DeepQ:
+    """What DQN has learned: the residual as a Q-function, and all it takes to go on."""
+
+    online: Networks
+    target: Networks
+    optimiser: Adam
+    steps: int = 0  # environment steps since the networks were new
+
+    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        check_width(states, self.online.sizes[0])
+        if isinstance(states, np.ndarray):
+            return self._values(self.online, states)
+        return each(states, lambda s: self._one(s, states[s]))
+
+    def _one(self, s: int, x: NDArray) -> NDArray:
+        networks = Networks(self.online.sizes, self.online.flat[s : s + 1])
+        return self._values(networks, x[None])[0]
+
+    def _values(self, networks: Networks, x: NDArray) -> NDArray[np.float64]:
+        """Values (S, n, A) at states (S, n, d)."""
+        flat, inputs = networks.flat, np.ascontiguousarray(x, np.float32)
+        if flat.device.type == "cpu":
+            sizes = np.array(networks.sizes)
+            return compiled.outputs(flat.numpy(), sizes, inputs).astype(np.float64)
+        values = networks.forward(torch.from_numpy(inputs).to(flat.device))
+        return values.cpu().numpy().astype(np.float64)
+
+    def clone(self) -> DeepQ:
+        """A copy that may be trained on without changing this one."""
+        return DeepQ(
+            self.online.clone(),
+            self.target.clone(),
+            self.optimiser.clone(),
+            self.steps,
+        )
+
+    def copy_target(self) -> None:
+        """The target becomes the online network."""
+        self.target.flat.copy_(self.online.flat)

@@ -1,0 +1,146 @@
+"""scikit-learn's regressors in fitted Q-iteration."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import inspect
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from bcrl.errors import ConfigError, at_least, did_you_mean
+from bcrl.q.regressors.base import Fit, Problem
+
+#: Where scikit-learn keeps regressors that take plain values.
+MODULES = (
+    *("dummy", "ensemble", "gaussian_process", "isotonic", "kernel_ridge"),
+    *("linear_model", "neighbors", "neural_network", "svm", "tree"),
+)
+
+
+class _Fitting:
+    """Fits a `_model(seed)` to each problem; multiplicities become repeated rows."""
+
+    finite_only = False
+
+    def fit(self, problems: Sequence[Problem], keep: bool, threads: int) -> list[Fit]:
+        """Fits, in order, each with a seed of its own."""
+        seeds = [int(p.rng.integers(2**31)) for p in problems]
+        with threadpool_limits(1):  # sums would depend on the number of threads
+            return list(map(self._fit_one, problems, seeds))
+
+    def _fit_one(self, problem: Problem, seed: int) -> Fit:
+        model = self._model(seed)
+        repeat = np.repeat(np.arange(len(problem.y)), problem.multiplicity)
+        model.fit(problem.x[repeat], problem.y[repeat])
+        both = model.predict(np.concatenate([problem.x, problem.queries]))
+        return Fit(model, *np.split(np.float64(both), [len(problem.y)]))
+
+    def predict(
+        self, models: Sequence[Any], x: Sequence[NDArray], threads: int
+    ) -> list[NDArray[np.float64]]:
+        """Each model's predictions (n,) at its own points (n, d)."""
+        with threadpool_limits(1):
+            return [np.float64(m.predict(p)) for m, p in zip(models, x, strict=True)]
+
+
+@dataclass(frozen=True)
+class Sklearn(_Fitting):
+    """Any regressor of scikit-learn, by its class's name and arguments.
+
+    In Python an estimator itself will do, a pipeline too. `standardise` puts a
+    StandardScaler before it. Whatever takes a `random_state` gets one a fit. Raises
+    ConfigError for a name or an argument that scikit-learn doesn't know.
+    """
+
+    estimator: Any
+    arguments: Any = None
+    standardise: bool = False
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.arguments, (dict, type(None))):
+            why = "must be names and values, or null"
+            raise ConfigError("algorithm.regressor.arguments", self.arguments, why)
+        try:
+            self._model(0)
+        except (TypeError, ValueError) as error:
+            place = "algorithm.regressor.arguments"
+            why = " ".join(str(error).split())
+            raise ConfigError(place, self.arguments, why) from error
+
+    def _model(self, seed: int) -> Any:
+        from sklearn.base import clone
+        from sklearn.pipeline import make_pipeline
+        from sklearn.preprocessing import StandardScaler
+
+        named = isinstance(self.estimator, str)
+        made = _class(self.estimator)() if named else clone(self.estimator)
+        known, arguments = made.get_params(), self.arguments or {}
+        for key, value in arguments.items():
+            if key not in known:
+                place = f"algorithm.regressor.arguments.{key}"
+                raise ConfigError(place, value, did_you_mean(key, known))
+        states = {k: seed for k in known if k.split("__")[-1] == "random_state"}
+        made.set_params(**states | arguments)
+        if hasattr(made, "_parameter_constraints"):  # or they wait for the first fit
+            made._validate_params()
+        return make_pipeline(StandardScaler(), made) if self.standardise else made
+
+
+@dataclass(frozen=True)
+class SklearnForest(_Fitting):
+    """scikit-learn's own extremely randomised trees: the judge of ours."""
+
+    trees: int = 50
+    min_samples_split: int = 5
+    min_samples_leaf: int = 2
+
+    def __post_init__(self) -> None:
+        at_least("algorithm.regressor.trees", self.trees, 1)
+        at_least("algorithm.regressor.min_samples_split", self.min_samples_split, 2)
+        at_least("algorithm.regressor.min_samples_leaf", self.min_samples_leaf, 1)
+
+    def _model(self, seed: int) -> Any:
+        from sklearn.ensemble import ExtraTreesRegressor
+
+        return ExtraTreesRegressor(
+            n_estimators=self.trees,
+            min_samples_split=self.min_samples_split,
+            min_samples_leaf=self.min_samples_leaf,
+            random_state=seed,
+        )
+
+
+def _class(name: str) -> type:
+    """scikit-learn's regressor called `name`; ConfigError if there is none."""
+    found = _regressors()
+    if name not in found:
+        raise ConfigError(
+            "algorithm.regressor.estimator", name, did_you_mean(name, found)
+        )
+    return found[name]
+
+
+@functools.cache
+def _regressors() -> dict[str, type]:
+    """Those that can be made without an argument, by name."""
+    from sklearn.base import RegressorMixin
+
+    return {
+        name: thing
+        for module in MODULES
+        for name, thing in vars(importlib.import_module(f"sklearn.{module}")).items()
+        if isinstance(thing, type)
+        and issubclass(thing, RegressorMixin)
+        and thing is not RegressorMixin
+        and not inspect.isabstract(thing)
+        and all(
+            p.default is not p.empty or p.kind is p.VAR_KEYWORD
+            for p in inspect.signature(thing).parameters.values()
+        )
+    }

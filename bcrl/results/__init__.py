@@ -1,0 +1,1 @@
+"""A seed's result files: one definition for writer and reader."""

@@ -1,0 +1,126 @@
+"""Live logging: what runs measure, sent elsewhere while they train."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from bcrl.common import plugins
+from bcrl.common.checks import construct, one_of
+from bcrl.errors import ConfigError
+
+#: Takes the name of the column that counts, and each seed's new rows.
+Log = Callable[[str, Sequence[Sequence[Mapping[str, float]]]], None]
+FOLDER = ".tensorboard"  # in runs_dir; hidden, so that nobody takes it for results
+
+
+class Writer(Protocol):
+    """Where one seed's rows go."""
+
+    def write(self, count: int, row: Mapping[str, float]) -> None:
+        """A row of the seed's CSV, by its count of iterations or steps."""
+
+    def close(self) -> None:
+        """Nothing more will come from this process."""
+
+
+class Logger(Protocol):
+    """A frozen dataclass; its fields are the YAML's keys besides `name`.
+
+    Made before work starts, it raises ConfigError if it can't do its work.
+    """
+
+    def open(self, runs_dir: Path, run: str) -> Writer:
+        """A writer for `run`, such as "quick/maze/BC-FQI/seed_0007".
+
+        A run that goes on after an interruption writes all its rows again.
+        """
+
+
+@dataclass(frozen=True)
+class Nothing:
+    """Logs nothing."""
+
+    def open(self, runs_dir: Path, run: str) -> Writer:
+        return self
+
+    def write(self, count: int, row: Mapping[str, float]) -> None: ...
+
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class TensorBoard:
+    """Event files in `<runs_dir>/.tensorboard`, a folder a seed."""
+
+    def __post_init__(self) -> None:
+        if importlib.util.find_spec("tensorboard") is None:
+            why = "needs a package: pip install 'boosted-curriculum-rl[tensorboard]'"
+            raise ConfigError("logger", "tensorboard", why)
+
+    def open(self, runs_dir: Path, run: str) -> Writer:
+        return _Events(runs_dir / FOLDER / run)
+
+
+class _Events:
+    """One seed's event file."""
+
+    def __init__(self, folder: Path) -> None:
+        from torch.utils.tensorboard import SummaryWriter  # slow to import
+
+        # Whatever an interrupted process has logged gives way to what comes.
+        self._events = SummaryWriter(folder, purge_step=0)
+
+    def write(self, count: int, row: Mapping[str, float]) -> None:
+        for name, value in row.items():
+            if np.isfinite(value):
+                self._events.add_scalar(name, value, count)
+
+    def close(self) -> None:
+        self._events.close()
+
+
+LOGGERS: dict[str, type] = {"none": Nothing, "tensorboard": TensorBoard}
+
+
+def logger(section: Any) -> Logger:
+    """What the section `logger` of a config asks for; ConfigError if it can't be.
+
+    Besides LOGGERS a class of the user's own may be named, as BCRL_TRUST allows.
+    """
+    if not isinstance(section, dict) or not isinstance(section.get("name"), str):
+        raise ConfigError("logger", section, "must be a section with a name")
+    values = {key: value for key, value in section.items() if key != "name"}
+    name = section["name"]
+    if "." in name:
+        return construct("logger", plugins.component("logger.name", name, name), values)
+    one_of("logger.name", name, list(LOGGERS))
+    return construct("logger", LOGGERS[name], values)
+
+
+@contextmanager
+def opened(
+    config: Mapping[str, Any], directory: Path, seeds: Sequence[int]
+) -> Iterator[Log]:
+    """What takes new rows of the run in `directory`, a list for each seed."""
+    made, root = logger(config["logger"]), Path(config["runs_dir"])
+    folder = directory.relative_to(root).as_posix()
+    writers: list[Writer] = []
+
+    def log(index: str, rows: Sequence[Sequence[Mapping[str, float]]]) -> None:
+        for writer, added in zip(writers, rows, strict=True):
+            for row in added:
+                rest = {key: value for key, value in row.items() if key != index}
+                writer.write(int(row[index]), rest)
+
+    with ExitStack() as stack:
+        for seed in seeds:
+            writers.append(made.open(root, f"{folder}/seed_{seed:04d}"))
+            stack.callback(writers[-1].close)
+        yield log

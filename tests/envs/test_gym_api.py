@@ -1,0 +1,239 @@
+"""Our environments behind Gymnasium's interface: the same episodes, and its checks."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from dataclasses import dataclass
+from itertools import pairwise, product
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import bcrl.envs.gym_api
+from bcrl.common.registration import REGISTERED
+from bcrl.envs import env_class, env_names
+from bcrl.envs.car_on_hill import CarOnHill
+from bcrl.envs.gym_api import GymEnv
+from bcrl.envs.linear_system import LinearSystem
+from bcrl.envs.maze import PRESETS, Maze
+from bcrl.envs.rendering import draw
+from bcrl.errors import BcrlError, ConfigError
+
+LINEAR = [
+    {"task": t, "preset": p}
+    for t, p in product(("lq", "target"), ("paper", "released"))
+]
+FACES = [
+    *(("CarOnHill", {"mass": mass}) for mass in (0.01, 0.8, 1.2)),
+    *(("Maze", {"preset": preset, "height": 0.5}) for preset in PRESETS),
+    *(("LinearSystem", constants) for constants in LINEAR),
+]
+everything = pytest.mark.parametrize(("name", "constants"), FACES, ids=str)
+
+
+def make(name: str, **options) -> gymnasium.Env:
+    return gymnasium.make(f"bcrl/{name}-v0", **options)
+
+
+@everything
+def test_gymnasiums_own_checks_pass_without_a_warning(name, constants):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(make(name, **constants).unwrapped)
+
+
+def test_all_are_registered_with_their_horizons():
+    ours = sorted(name for name, _ in REGISTERED.values())
+    assert ours == [name for name in env_names() if name != "gymnasium"]
+    for name, (env, horizon) in REGISTERED.items():
+        assert env_class(env).__name__ == name
+        assert env_class(env).horizon == horizon
+        assert make(name).spec.max_episode_steps == horizon
+
+
+def test_the_import_is_light_and_the_id_may_name_the_module():
+    program = (
+        "import sys, gymnasium; gymnasium.make('bcrl.gym:bcrl/Maze-v0', height=0.5)\n"
+        "sys.exit(bool({'torch', 'numba', 'matplotlib'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", program]).returncode == 0
+
+
+@everything
+def test_an_episode_is_the_pure_environments(name, constants):
+    face = make(name, **constants)
+    ours = env_class(REGISTERED[name][0])(**constants)
+    state, info = face.reset(seed=7)
+    luck, choices = np.random.default_rng(7), np.random.default_rng(1)
+    expected = ours.initial(luck.random(ours.initial_noise))
+    assert info == {} and state.tolist() == expected.tolist()
+    for t in range(ours.horizon):
+        action = int(choices.integers(ours.n_actions))
+        state, reward, terminated, truncated, info = face.step(action)
+        noise = luck.random(ours.step_noise)
+        expected, r, absorbing = ours.step(expected, np.int64(action), noise)
+        assert state.tolist() == expected.tolist()
+        assert (reward, terminated) == (r, absorbing)
+        assert info == {"is_success": bool(absorbing and r >= 0)}
+        assert truncated == (t == ours.horizon - 1)
+        if terminated or truncated:
+            return
+    raise AssertionError("an episode has no end")
+
+
+@everything
+def test_many_at_once_are_as_gymnasium_does_it_one_by_one(name, constants):
+    options = {"num_envs": 5, "max_episode_steps": 30, **constants}
+    kinds = ("vector_entry_point", "sync")
+    ours, theirs = (
+        gymnasium.make_vec(f"bcrl/{name}-v0", vectorization_mode=kind, **options)
+        for kind in kinds
+    )
+    assert isinstance(ours, bcrl.envs.gym_api.GymVectorEnv)
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert ours.metadata["autoreset_mode"] == theirs.metadata["autoreset_mode"]
+    ours.action_space.seed(3)
+
+    def agree(a, b):
+        *values, info = a
+        *known, expected = b
+        assert all(np.array_equal(x, y) for x, y in zip(values, known, strict=True))
+        assert info.keys() == expected.keys()
+        assert all(np.array_equal(info[key], expected[key]) for key in info)
+
+    agree(ours.reset(seed=11), theirs.reset(seed=11))
+    for _ in range(70):  # over two ends
+        actions = ours.action_space.sample()
+        agree(ours.step(actions), theirs.step(actions))
+    mask = np.array([True, False, True, False, False])
+    several = [envs.reset(options={"reset_mask": mask}) for envs in (ours, theirs)]
+    agree(*several)
+    actions = ours.action_space.sample()
+    agree(ours.step(actions), theirs.step(actions))
+
+
+@everything
+def test_no_state_leaves_the_box(name, constants):
+    box = make(name, **constants).observation_space
+    envs = gymnasium.make_vec(f"bcrl/{name}-v0", num_envs=200, **constants)
+    envs.action_space.seed(0)
+    seen = [envs.reset(seed=0)[0]]
+    for t in range(150):  # each action held for a while leads far
+        if t % 25 == 0:
+            actions = envs.action_space.sample()
+        seen.append(envs.step(actions)[0])
+    whole = np.concatenate(seen)
+    assert ((whole >= box.low) & (whole <= box.high)).all()
+
+
+def test_a_car_at_its_fastest_stays_in_the_box():
+    p, v = np.meshgrid(np.linspace(-1, 1, 101), np.linspace(-3, 3, 31))
+    states = np.stack([p, v], -1)
+    for mass, action in product((0.2, 0.8, 1.0, 1.2, 5.0), (0, 1)):
+        car = CarOnHill(mass)
+        low, high = car.bounds
+        after, _, absorbing = car.step(states, np.full(p.shape, action))
+        assert absorbing.any() and ((after >= low) & (after <= high)).all()
+
+
+def test_a_seed_reproduces_an_episode_and_another_does_not():
+    face = make("LinearSystem")
+
+    def episode(seed):
+        first, _ = face.reset(seed=seed)
+        return np.stack([first] + [face.step(0)[0] for _ in range(40)]).tolist()
+
+    assert episode(1) == episode(1) != episode(2)
+
+
+def test_what_cannot_be_is_refused_with_the_key():
+    for options, message in (
+        ({"mas": 1.0}, r"env.mas=1.0: unknown key; did you mean mass\?"),
+        ({"mass": -1.0}, r"env.mass=-1.0: must be positive"),
+        ({"mass": "heavy"}, r"env.mass=heavy: must be of type float"),
+        ({"horizon": 10}, r"max_episode_steps"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            make("CarOnHill", **options)
+    with pytest.raises(BcrlError, match="did you mean maze"):
+        GymEnv("mase")
+    with pytest.raises(ConfigError, match="render_mode=ansi"):
+        GymEnv("maze", render_mode="ansi")
+    with pytest.raises(TypeError, match="mass"):
+        GymEnv(CarOnHill(), mass=1.0)
+    face = make("Maze")
+    face.reset(seed=0)
+    for action in (-1, 4, 0.5):
+        with pytest.raises(ValueError, match="no action"):
+            face.step(action)
+    assert make("CarOnHill", mass=np.linspace(1, 2, 3)[1]).unwrapped.task.mass == 1.5
+
+
+@everything
+def test_pictures_show_the_state(name, constants):
+    face = make(name, render_mode="rgb_array", **constants)
+    pictures = []
+    face.reset(seed=0)
+    for _ in range(3):
+        pictures.append(face.render())
+        face.step(1)
+    for picture in pictures:
+        assert picture.shape == (400, 400, 3) and picture.dtype == np.uint8
+    changed = [(a != b).sum() for a, b in pairwise(pictures)]
+    assert min(changed) > 100
+
+
+def test_pictures_show_the_action_and_bear_any_state():
+    for env in (CarOnHill(), Maze(), LinearSystem(), LinearSystem(task="lq")):
+        here = np.full((1, env.state_dim), 0.3)
+        shown = [draw(env, here, action) for action in (None, 0, env.n_actions - 1)]
+        assert (shown[0] != shown[1]).any() and (shown[1] != shown[2]).any()
+        far = np.full((3, env.state_dim), -1e9)
+        assert draw(env, far).shape == (400, 400, 3)
+    for odd in (np.inf, np.nan):  # a car that is too light is lost so
+        assert draw(CarOnHill(), np.full((1, 2), odd)).shape == (400, 400, 3)
+    force = draw(LinearSystem(task="lq"), np.zeros((1, 4)), np.array([1.0, 0.0]))
+    assert (force == draw(LinearSystem(task="lq"), np.zeros((1, 4)), 0)).all()
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Of a user: a random walk, without bounds and without a picture of its own."""
+
+    gamma: float = 0.9
+    horizon: int = 10
+
+    name = "walk"
+    n_actions = 2
+    state_dim = 1
+    initial_noise = 1
+    step_noise = 1
+    actions = np.array([[-1.0], [1.0]])
+
+    def initial(self, noise):
+        return noise
+
+    def step(self, state, action, noise):
+        after = state + self.actions[action] + noise
+        return after, -abs(after[..., 0]), abs(after[..., 0]) > 5
+
+
+def test_an_environment_of_ones_own_gets_a_face():
+    face = GymEnv(Walk(), render_mode="rgb_array")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(face, skip_render_check=True)
+    first, _ = face.reset(seed=1)
+    before = face.render()
+    second = face.step(1)[0]
+    luck = np.random.default_rng(1)
+    assert first == luck.random(1) and second == first + 1.0 + luck.random(1)
+    assert (face.render() != before).any()
+    cut = gymnasium.wrappers.TimeLimit(GymEnv(Walk()), Walk().horizon)
+    cut.reset(seed=0)
+    assert [cut.step(t % 2)[3] for t in range(10)] == [False] * 9 + [True]

@@ -1,0 +1,71 @@
+"""Metrics, recomputed by hand and from what a run leaves."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from bcrl.envs.car_on_hill import CarOnHill
+from bcrl.envs.maze import Maze
+from bcrl.errors import ConfigError
+from bcrl.evaluation import oracle
+from bcrl.evaluation.metrics import METRICS, View, check, probed_states
+from bcrl.run import runner
+from tests.conftest import plan
+
+
+def test_the_metrics_by_hand():
+    view = View(
+        q=np.array([[1.0, 3.0], [5.0, 5.0], [0.0, -2.0]]),
+        residual=np.array([[0.5, 1.5], [0.0, 0.0], [9.0, 9.0]]),
+        returns=np.array([2.0, 4.0]),
+        solved=np.array([True, False]),
+        start=np.array([0]),
+        reference=np.array([1, 2]),
+        q_star=np.array([[4.0, 5.0], [1.0, 0.0]]),
+        optimum=10.0,
+    )
+    found = {name: metric(view) for name, metric in METRICS.items()}
+    assert found == {
+        "return": 3.0,
+        "q_error": (1 + 0 + 1 + 2) / 4,
+        "q_error_start": (9 + 7) / 2,
+        "residual_start": 1.0,
+        "solved": 0.5,
+    }
+
+
+def test_a_maze_run_recomputed_from_its_arrays(tmp_path):
+    small = ("scale=smoke", "seeds.count=1", "progress=none", f"runs_dir={tmp_path}")
+    p = plan("env=maze", "curriculum=on", "boosting=on", *small)
+    runner.run(p)
+    rows = list(csv.DictReader((p.directory / "seed_0000.csv").open()))
+    with np.load(p.directory / "seed_0000.npz") as stored:
+        residuals, path = stored["residuals"], stored["trajectory"]
+    target_start = oracle.reference(Maze(0.95)).q[0].max()  # in every stage
+    for stage, env in enumerate(p.tasks):
+        row = {k: float(v) for k, v in rows[2 * stage + 1].items()}
+        q = residuals[: stage + 1].sum(0)
+        assert row["q_error_start"] == pytest.approx(abs(q[0] - target_start).mean())
+        assert row["residual_start"] == pytest.approx(residuals[stage][0].mean())
+        known = oracle.reference(env)  # the current task's
+        error = abs(q[env.index(known.states)] - known.q).mean()
+        assert row["q_error"] == pytest.approx(error)
+    distance = abs(path[1:] - 0.95).sum(1)
+    reward = np.where(distance < 0.1 + 1e-9, 5.0, -distance)
+    discount = 0.99 ** np.arange(len(reward))
+    assert row["return"] == pytest.approx((discount * reward).sum())
+    assert row["solved"] == float(reward[-1] == 5.0)
+
+
+def test_the_hill_is_measured_on_its_grid():
+    grid = CarOnHill().evaluation_states()
+    asked = probed_states(CarOnHill(mass=1.2))
+    assert {tuple(s) for s in asked.tolist()} == {tuple(s) for s in grid.tolist()}
+    assert oracle.reference(CarOnHill(mass=1.2)).q.shape == (100, 2)
+
+
+@pytest.mark.parametrize("metrics", [["retrun"], [["return"]], ["q_error_start"]])
+def test_impossible_metrics_are_refused(metrics):
+    with pytest.raises(ConfigError, match=r"env.metrics"):
+        check(metrics, CarOnHill())

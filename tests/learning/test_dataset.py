@@ -1,0 +1,50 @@
+"""Datasets keep every transition, once, with its count."""
+
+import numpy as np
+import pytest
+
+from bcrl.common.seeding import stream
+from bcrl.learning import dataset
+from bcrl.learning.rollout import draws, rollout, start_states
+from bcrl.q.functions import ZERO
+from tests.toys import Corridor, OpenCorridor
+
+
+@pytest.mark.parametrize("env", [Corridor(), OpenCorridor()])
+def test_the_dataset_is_the_episodes_with_repetitions_counted(env):
+    rng = stream(0, "data")
+    start, u = start_states(rng, env, 40)[None], draws(rng, env, 40)[None]
+    played = rollout(env, ZERO, start, u, 1.0)
+    probe = np.array([[2.0], [0.0]])
+    d = dataset.build(env, played, 0, probe)
+
+    def rows(*columns):
+        return sorted(
+            zip(*(np.asarray(c).ravel().tolist() for c in columns), strict=True)
+        )
+
+    kept = np.arange(env.horizon) < played.length[0][:, None]
+    expected = rows(
+        played.state[0, :, :-1][kept],
+        played.action[0][kept],
+        played.reward[0][kept],
+        played.state[0, :, 1:][kept],
+        played.absorbing[0][kept],
+    )
+    again = np.repeat(np.arange(len(d.state)), d.multiplicity)
+    found = rows(
+        d.points[d.state[again]],
+        d.action[again],
+        d.reward[again],
+        d.points[d.next_state[again]],
+        d.absorbing[again],
+    )
+    assert found == expected
+    if env.finite:
+        assert len(d.state) <= 10 < len(expected)  # the corridor repeats itself
+    assert np.array_equal(d.points[d.probe], probe)
+    for a, part in enumerate(d.by_action):
+        assert (d.action[part.rows] == a).all()
+        asked = set(part.x.ravel().tolist()) | set(part.queries.ravel().tolist())
+        assert asked == set(d.points.ravel().tolist())
+        assert not set(part.x.ravel().tolist()) & set(part.queries.ravel().tolist())

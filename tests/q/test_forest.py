@@ -1,0 +1,484 @@
+"""The forest engine: scikit-learn judges its statistics, arithmetic the rest."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+from sklearn.ensemble import ExtraTreesRegressor
+from sklearn.utils.estimator_checks import parametrize_with_checks
+
+from bcrl.errors import BcrlError, ConfigError
+from bcrl.q.forest.descend import TOGETHER
+from bcrl.q.forest.estimator import ExtraTrees
+from bcrl.q.forest.forest import (
+    Forest,
+    Regression,
+    TreeSettings,
+    fit_forests,
+    join,
+    predict_forests,
+)
+
+PAPER = TreeSettings(min_samples_split=5, min_samples_leaf=2)
+SEEDS = 200  # forests per side of a comparison
+TREES = 3
+
+
+def seeds(number: int, key: int = 0) -> np.ndarray:
+    return np.random.default_rng(key).integers(0, 2**64, number, dtype=np.uint64)
+
+
+def dyadic(y: np.ndarray) -> np.ndarray:
+    """`y` in steps of 1/256: sums and variances are then exact in scikit-learn too."""
+    return np.round(y * 256) / 256
+
+
+def problem(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray]:
+    """x, y, multiplicity and test points."""
+    rng = np.random.default_rng(7)
+    if name == "continuous":
+        x = rng.uniform(-1, 1, (250, 2))
+        y, counts = (
+            np.sin(4 * x[:, 0]) + (x[:, 1] > 0.2) + rng.normal(0, 0.2, 250),
+            None,
+        )
+        points = rng.uniform(-1.2, 1.2, (12, 2))
+    elif name == "lattice":
+        x = np.stack(np.meshgrid(np.arange(9), np.arange(9)), -1).reshape(-1, 2) / 8
+        y, counts = -np.abs(x - 0.75).sum(1), rng.integers(1, 6, 81)
+        points = rng.uniform(0, 1, (12, 2))
+    elif name == "ties":
+        x = np.stack(np.meshgrid(np.arange(4), np.arange(4)), -1).reshape(-1, 2) / 4
+        y, counts = (np.arange(16) % 5 == 0).astype(float), None
+        points = rng.uniform(0, 0.75, (12, 2))
+    else:  # four features, one of them constant, one with few values
+        x = rng.normal(size=(120, 4))
+        x[:, 1], x[:, 2] = 0.25, np.round(x[:, 2])
+        y, counts = x[:, 0] * x[:, 2] + x[:, 3], rng.integers(1, 4, 120)
+        points = rng.normal(size=(12, 4))
+    return x.astype(np.float32), dyadic(y), counts, points.astype(np.float32)
+
+
+def sample(name: str, settings: TreeSettings, how: str) -> np.ndarray:
+    """A row per forest seed: predictions at the test points, nodes, depth."""
+    x, y, counts, points = problem(name)
+    out = np.empty((SEEDS, len(points) + 2))
+    if how != "multiplicity" and counts is not None:
+        x, y, counts = np.repeat(x, counts, 0), np.repeat(y, counts), None
+    for k in range(SEEDS):
+        if how == "scikit-learn":
+            model = ExtraTreesRegressor(
+                TREES,
+                min_samples_split=settings.min_samples_split,
+                min_samples_leaf=settings.min_samples_leaf,
+                max_features=settings.max_features or 1.0,
+                random_state=k,
+            ).fit(x, y)
+            trees = [tree.tree_ for tree in model.estimators_]
+            nodes = [tree.node_count for tree in trees]
+            depths = [tree.max_depth for tree in trees]
+            predicted = model.predict(points)
+        else:
+            key = 10_000 * (1 + ("repeated", "multiplicity").index(how)) + k
+            task = Regression(x, y, seeds(TREES, key), counts, points)
+            fit = fit_forests([task], settings)[0]
+            nodes, depths = fit.forest.node_counts, fit.forest.depths
+            predicted = fit.queried
+        out[k] = *predicted, np.mean(nodes), np.mean(depths)
+    return out
+
+
+COMPARED = [
+    ("continuous", PAPER),
+    ("continuous", TreeSettings(2, 1)),
+    ("lattice", PAPER),
+    ("lattice", TreeSettings(9, 4)),
+    ("ties", TreeSettings(2, 1)),
+    ("features", PAPER),
+    ("features", TreeSettings(4, 1, max_features=1)),
+    ("features", TreeSettings(2, 2, max_features=2)),
+]
+
+
+def p_values(one: np.ndarray, other: np.ndarray) -> list[float]:
+    """Equality of mean, spread and distribution, column by column."""
+    found = []
+    for a, b in zip(one.T, other.T, strict=True):
+        if np.ptp(np.concatenate([a, b])) < 1e-12:
+            continue
+        found.append(stats.ttest_ind(a, b, equal_var=False).pvalue)
+        found.append(stats.levene(a, b, center="median").pvalue)
+        found.append(stats.ks_2samp(a, b).pvalue)
+    return found
+
+
+@pytest.fixture(scope="module")
+def comparisons() -> dict[str, list[float]]:
+    """p-values of ours against scikit-learn's, multiplicities and repeated rows."""
+    found: dict[str, list[float]] = {}
+    for name, settings in COMPARED:
+        judge = sample(name, settings, "scikit-learn")
+        for how in ("repeated", "multiplicity"):
+            found[f"{name} {settings} {how}"] = p_values(
+                judge, sample(name, settings, how)
+            )
+    return found
+
+
+def test_same_distribution_as_scikit_learn(comparisons):
+    """No difference at family-wise level 0.001 (Bonferroni over all tests)."""
+    tests = sum(map(len, comparisons.values()))
+    assert tests > 500
+    least = {name: min(found) for name, found in comparisons.items()}
+    assert min(least.values()) > 0.001 / tests, least
+
+
+def test_the_comparison_notices_a_wrong_setting():
+    """Power: a minimum leaf of 3 for 2 is found out."""
+    judge = sample("continuous", PAPER, "scikit-learn")
+    wrong = sample("continuous", TreeSettings(5, 3), "repeated")
+    assert min(p_values(judge, wrong)) < 1e-9
+
+
+@pytest.mark.parametrize("name", ["lattice", "features"])
+@pytest.mark.parametrize("most", [None, 1])
+def test_multiplicities_are_repeated_rows_bit_for_bit(name, most):
+    x, y, counts, points = problem(name)
+    order = np.random.default_rng(1).permutation(counts.sum())
+    rows = np.repeat(np.arange(len(x)), counts)[order]
+    y = y + np.random.default_rng(2).normal(size=len(y))
+    tasks = [
+        Regression(x, y, seeds(20), counts, points),
+        Regression(x[rows], y[rows], seeds(20), None, points),
+        Regression(x[rows], y[rows], seeds(20), np.ones(len(rows), np.int64), points),
+    ]
+    settings = TreeSettings(7, 3, max_features=most)
+    one, *others = fit_forests(tasks, settings)
+    for other in others:
+        assert one.forest.nodes.tobytes() == other.forest.nodes.tobytes()
+        assert one.forest.values.tobytes() == other.forest.values.tobytes()
+        assert one.queried.tobytes() == other.queried.tobytes()
+        assert (one.fitted[rows] == other.fitted).all()
+
+
+def hill(n: int, key: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(key)
+    x = rng.uniform([-1, -3], [1, 3], (n, 2)).astype(np.float32)
+    return x, np.sign(x[:, 1]) * 0.95 ** np.floor(9 * (1 - x[:, 0])) * (x[:, 0] > -0.5)
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
+def test_predictions_while_growing_are_the_forests_bit_for_bit(d):
+    rng = np.random.default_rng(d)
+    x = rng.normal(size=(900, d)).astype(np.float32)
+    queries = rng.normal(size=(2000, d)).astype(np.float32)
+    y = rng.normal(size=900)
+    assert len(queries) > TOGETHER
+    fit = fit_forests([Regression(x, y, seeds(7), None, queries)], PAPER)[0]
+    assert (fit.forest.predict(x) == fit.fitted).all()
+    assert (fit.forest.predict(queries) == fit.queried).all()
+    # Few rows are walked one by one, many are moved together.
+    few = [fit.forest.predict(part) for part in np.array_split(queries, 50)]
+    assert (np.concatenate(few) == fit.queried).all()
+
+
+def test_neither_threads_nor_company_nor_keeping_change_a_forest():
+    tasks = []
+    for k in range(6):
+        x, y = hill(300 + 50 * k, k)
+        tasks.append(Regression(x, y, seeds(5, k), None, hill(40, 99)[0]))
+    alone = [fit_forests([task], PAPER)[0] for task in tasks]
+    for fits in (
+        fit_forests(tasks, PAPER),
+        fit_forests(tasks, PAPER, threads=4),
+        fit_forests(tasks, PAPER, threads=3, keep=False),
+    ):
+        for one, other in zip(alone, fits, strict=True):
+            assert one.fitted.tobytes() == other.fitted.tobytes()
+            assert one.queried.tobytes() == other.queried.tobytes()
+            if other.forest is not None:
+                assert one.forest.nodes.tobytes() == other.forest.nodes.tobytes()
+    assert fits[0].forest is None
+    forests, points = [fit.forest for fit in alone], [task.x for task in tasks]
+    for threads in (1, 4):
+        for got, one in zip(
+            predict_forests(forests, points, threads=threads), alone, strict=True
+        ):
+            assert (got == one.fitted).all()
+
+
+def leaves_of(forest: Forest, tree: int, x: np.ndarray) -> np.ndarray:
+    """The leaf node of every row, by walking the stored tree in plain Python."""
+    bits = forest.nodes["cut"].copy()
+    bits = np.where(bits < 0, bits ^ np.int32(0x7FFFFFFF), bits).astype(np.int32)
+    cuts = bits.view(np.float32)
+    found = []
+    for point in x:
+        node = forest.first[tree]
+        while forest.nodes["feature"][node] >= 0:
+            right = point[forest.nodes["feature"][node]] > cuts[node]
+            node = forest.nodes["child"][node] + right
+        found.append(node)
+    return np.array(found)
+
+
+def test_leaves_hold_means_and_enough_rows():
+    x, y = hill(400, 3)
+    y = y + np.random.default_rng(0).normal(size=400)
+    counts = np.random.default_rng(1).integers(1, 4, 400)
+    fit = fit_forests([Regression(x, y, seeds(3), counts)], TreeSettings(9, 4))[0]
+    sums = np.zeros(400)
+    for tree in range(3):
+        leaves = leaves_of(fit.forest, tree, x)
+        for leaf in np.unique(leaves):
+            here = leaves == leaf
+            assert counts[here].sum() >= 4
+            mean = np.average(y[here], weights=counts[here])
+            stored = fit.forest.values[fit.forest.nodes["child"][leaf]]
+            assert stored == pytest.approx(mean, abs=1e-13)
+            sums[here] += mean
+    np.testing.assert_allclose(fit.fitted, sums / 3, atol=1e-13)
+    bytes_a_node = (fit.forest.nodes.nbytes + fit.forest.values.nbytes) / len(
+        fit.forest.nodes
+    )
+    assert bytes_a_node <= 16.1
+
+
+@pytest.mark.parametrize("scale", [1e-290, 1e-9, 1.0, 1e12, 1e300])
+def test_every_scale_of_targets_is_interpolated(scale):
+    x, _ = hill(200, 5)
+    y = np.random.default_rng(0).normal(size=200) * scale
+    fit = fit_forests([Regression(x, y, seeds(3))], TreeSettings())[0]
+    if scale > 1e-8:
+        np.testing.assert_allclose(fit.fitted, y, rtol=0, atol=1e-14 * np.abs(y).max())
+    else:  # a variance below float64's eps counts as none, as in scikit-learn
+        assert (fit.forest.node_counts == 1).all()
+        np.testing.assert_allclose(fit.fitted, y.mean(), atol=1e-14 * np.abs(y).max())
+
+
+def test_constant_targets_and_constant_features_give_one_leaf():
+    x, _ = hill(50, 0)
+    fits = fit_forests(
+        [
+            Regression(x, np.full(50, -1.85), seeds(4)),
+            Regression(np.full((50, 2), 3, np.float32), np.arange(50.0), seeds(4)),
+            Regression(x[:1], np.array([0.3]), seeds(4), np.array([9])),
+        ],
+        TreeSettings(),
+    )
+    for fit, mean in zip(fits, (-1.85, 24.5, 0.3), strict=True):
+        assert (fit.forest.node_counts == 1).all() and (fit.forest.depths == 0).all()
+        np.testing.assert_allclose(fit.fitted, mean, rtol=1e-14)
+
+
+def test_tree_seeds_decide_each_tree_alone():
+    x, y = hill(300, 1)
+    whole = fit_forests([Regression(x, y, seeds(6))], PAPER)[0].forest
+    parts = [Regression(x, y, part) for part in np.split(seeds(6), [1, 4])]
+    joined = join([fit.forest for fit in fit_forests(parts, PAPER)])
+    assert joined.nodes.tobytes() == whole.nodes.tobytes()
+    assert (joined.first == whole.first).all() and (joined.values == whole.values).all()
+    assert len(set(whole.node_counts)) > 1
+
+
+def test_bad_input_is_refused():
+    x, y = hill(20, 0)
+    good = {"x": x, "y": y, "tree_seeds": seeds(2)}
+    for bad, message in (
+        ({"x": x[0]}, "shape"),
+        ({"x": np.full_like(x, np.nan)}, "NaN"),
+        ({"y": y[1:]}, "shape"),
+        ({"y": np.full_like(y, np.inf)}, "infinity"),
+        ({"tree_seeds": seeds(0)}, "tree_seeds"),
+        ({"multiplicity": np.zeros(20, np.int64)}, "multiplicity"),
+        ({"queries": x[:, :1]}, "queries"),
+    ):
+        with pytest.raises(BcrlError, match=message):
+            fit_forests([Regression(**(good | bad))], PAPER)
+    for settings in (TreeSettings(1), TreeSettings(2, 0), TreeSettings(2, 1, 0)):
+        with pytest.raises(ConfigError, match="at least"):
+            fit_forests([Regression(**good)], settings)
+    with pytest.raises(ConfigError, match="threads"):
+        fit_forests([Regression(**good)], PAPER, threads=0)
+
+
+#: None of scikit-learn's checks is expected to fail: what `ExtraTrees` lacks (several
+#: outputs, sparse X, missing values, fractional weights), its tags and errors say.
+EXPECTED_FAILURES: dict[str, str] = {}
+
+
+@parametrize_with_checks(
+    [ExtraTrees(n_estimators=5), ExtraTrees(20, max_depth=9, max_features="sqrt")],
+    expected_failed_checks=lambda _: EXPECTED_FAILURES,
+)
+def test_estimator_passes_scikit_learns_own_checks(estimator, check):
+    check(estimator)
+
+
+def test_estimator_counts_multiplicities_and_ignores_jobs():
+    x, y, counts, points = problem("lattice")
+    one = ExtraTrees(9, min_samples_leaf=2, random_state=3).fit(x, y, counts)
+    rows = np.repeat(np.arange(len(x)), counts)
+    two = ExtraTrees(9, min_samples_leaf=2, random_state=3, n_jobs=4)
+    two.fit(x[rows], y[rows])
+    assert (one.predict(points) == two.predict(points)).all()
+    with pytest.raises(ValueError, match="multiplicity"):
+        one.fit(x, y, counts * 0)
+
+
+def three_features(n=300):
+    rng = np.random.default_rng(5)
+    x = rng.uniform(-1, 1, (n, 3)).astype(np.float32)
+    return x, dyadic(2 * x[:, 0] + x[:, 1] ** 2 + rng.normal(0, 0.1, n))
+
+
+@pytest.mark.parametrize("deepest", [1, 2, 5])
+def test_trees_end_at_their_depth_as_scikit_learns(deepest):
+    x, y = three_features()
+    ours = [
+        ExtraTrees(3, max_depth=deepest, random_state=k).fit(x, y) for k in range(60)
+    ]
+    assert max(m.forest_.depths.max() for m in ours) == deepest
+    theirs = [
+        ExtraTreesRegressor(3, max_depth=deepest, random_state=k).fit(x, y)
+        for k in range(60)
+    ]
+    a = np.array([[*m.predict(x[:8]), m.forest_.node_counts.mean()] for m in ours])
+    b = np.array(
+        [
+            [*m.predict(x[:8]), np.mean([t.tree_.node_count for t in m.estimators_])]
+            for m in theirs
+        ]
+    )
+    assert min(p_values(a, b)) > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("most", "tried"),
+    [(None, 7), (1.0, 7), (0.5, 3), (0.01, 1), ("sqrt", 2), ("log2", 2), (3, 3)],
+)
+def test_max_features_counts_as_scikit_learns(most, tried):
+    x = np.random.default_rng(0).normal(size=(60, 7)).astype(np.float32)
+    y = x @ np.arange(7.0)
+    theirs = ExtraTreesRegressor(1, max_features=most or 1.0).fit(x, y)
+    assert theirs.estimators_[0].max_features_ == tried
+    one, other = (
+        ExtraTrees(4, max_features=m, random_state=1).fit(x, y) for m in (most, tried)
+    )
+    assert one.forest_.nodes.tobytes() == other.forest_.nodes.tobytes()
+    fewer = ExtraTrees(4, max_features=tried + 1, random_state=1).fit(x, y)
+    assert tried == 7 or one.forest_.nodes.tobytes() != fewer.forest_.nodes.tobytes()
+
+
+def test_importances_are_scikit_learns():
+    x, y = three_features()
+    counts = np.random.default_rng(3).integers(0, 4, len(x))
+    settings = {"min_samples_leaf": 4, "random_state": 0}
+    ours = ExtraTrees(300, **settings).fit(x, y, counts)
+    repeated = np.repeat(np.arange(len(x)), counts)
+    theirs = ExtraTreesRegressor(300, **settings).fit(x[repeated], y[repeated])
+    found = ours.feature_importances_
+    np.testing.assert_allclose(found, theirs.feature_importances_, atol=0.01)
+    assert found.sum() == pytest.approx(1.0) and found.argmax() == 0
+    joint = ExtraTrees(300, n_jobs=2, **settings).fit(x, y, counts)
+    assert np.array_equal(joint.feature_importances_, found)
+    x *= 0  # whoever changes the data afterwards changes no importance
+    assert np.array_equal(ours.feature_importances_, found)
+    flat = ExtraTrees(5).fit(x, y)
+    assert flat.feature_importances_.tolist() == [0, 0, 0]
+
+
+def test_importances_of_one_split_by_hand():
+    x = np.array([[0.0, 5.0], [0.0, 5.0], [1.0, 5.0]], np.float32)
+    model = ExtraTrees(3, random_state=0).fit(x, [1.0, 1.0, 4.0])
+    assert model.feature_importances_.tolist() == [1.0, 0.0]
+
+
+def test_weights_are_repeated_rows_and_zero_leaves_a_row_out():
+    x, y = three_features(80)
+    counts = np.random.default_rng(0).integers(0, 4, 80)
+    rows = np.repeat(np.arange(80), counts)
+    expected = ExtraTrees(5, random_state=2).fit(x[rows], y[rows]).predict(x)
+    model = ExtraTrees(5, random_state=2)
+    for given in (
+        {"sample_weight": counts},
+        {"sample_weight": counts.astype(float).tolist()},
+        {"multiplicity": counts},
+    ):
+        assert np.array_equal(model.fit(x, y, **given).predict(x), expected)
+
+
+@pytest.mark.parametrize("name", ["sample_weight", "multiplicity"])
+@pytest.mark.parametrize("value", [1.9, 0.5, -1, np.nan, np.inf, 2.0**41])
+def test_other_weights_than_whole_numbers_are_refused(name, value):
+    x, y = three_features(10)
+    weights = np.ones(10)
+    weights[4] = value
+    with pytest.raises(ValueError, match=r"sample_weight"):
+        ExtraTrees(2).fit(x, y, **{name: weights})
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("max_features", x) for x in (0, -1, 0.0, 1.5, "auto", True, [1])),
+        *(("max_depth", x) for x in (0, -3, 2.5, "deep")),
+        *(("n_jobs", x) for x in (0, 1.5, "all")),
+        *(("n_estimators", x) for x in (0, 2.5, None)),
+        *(("min_samples_split", x) for x in (1, 0.5)),
+        *(("min_samples_leaf", x) for x in (0, 0.5)),
+    ],
+)
+def test_a_bad_parameter_is_refused_by_name_and_value(key, value):
+    x, y = three_features(10)
+    with pytest.raises(ValueError, match=f"{key}=") as told:
+        ExtraTrees().set_params(**{key: value}).fit(x, y)
+    assert str(value) in str(told.value)
+
+
+def test_points_that_are_none_or_too_large_are_refused_as_by_scikit_learn():
+    x, y = three_features(10)
+    ours, theirs = (kind(2).fit(x, y) for kind in (ExtraTrees, ExtraTreesRegressor))
+    for points in (x[:0], x * np.float64(1e300), x[:, :2]):
+        for model in (ours, theirs):
+            with np.errstate(all="ignore"), pytest.raises(ValueError):
+                model.predict(points)
+
+
+def test_a_plain_processor_grows_the_same_trees():
+    """Without AVX-512 rows move one by one; the forests are the same bytes."""
+    code = (
+        "import tests.test_forest as t, hashlib\n"
+        "print(hashlib.sha256(t.grown_bytes()).hexdigest())"
+    )
+    plain = dict(os.environ, NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="")
+    root = Path(__file__).parents[2]
+    found = subprocess.run(
+        [sys.executable, "-c", code],
+        env=plain,
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert found.stdout.strip() == hashlib.sha256(grown_bytes()).hexdigest()
+
+
+def grown_bytes() -> bytes:
+    """Trees and predictions of forests with and without multiplicities."""
+    rng = np.random.default_rng(11)
+    x = rng.normal(size=(700, 2)).astype(np.float32)
+    y, counts = np.sin(3 * x[:, 0]) + x[:, 1], rng.integers(1, 5, 700)
+    tasks = [Regression(x, y, seeds(5), how, x[::3] / 2) for how in (None, counts)]
+    parts = [
+        (fit.forest.nodes, fit.forest.values, fit.fitted, fit.queried)
+        for fit in fit_forests(tasks, PAPER)
+    ]
+    return b"".join(array.tobytes() for part in parts for array in part)

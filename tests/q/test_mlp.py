@@ -1,0 +1,332 @@
+"""The stacked networks and both updates against torch's own modules and optimiser."""
+
+import itertools
+import math
+from copy import deepcopy
+
+import numpy as np
+import pytest
+import torch
+from numba import njit
+from threadpoolctl import threadpool_limits
+from torch.nn import functional
+
+from bcrl.common.seeding import stream
+from bcrl.learning.dqn_update import batched, one_by_one, updater
+from bcrl.learning.replay import Replay
+from bcrl.q import compiled
+from bcrl.q.networks import tiles
+from bcrl.q.networks.mlp import Adam, DeepQ, Networks, xavier
+
+D, A, BATCH = 4, 8, 32
+HIDDEN = pytest.mark.parametrize("hidden", [(128, 128), (64,), (33, 20, 7)])
+WAYS = pytest.mark.parametrize("way", [batched, one_by_one])
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """As DQN runs them: threads only get into each other's way here."""
+    with threadpool_limits(1):
+        yield
+
+
+def networks(hidden, seeds, purpose="weights"):
+    sizes = (D, *hidden, A)
+    drawn = [xavier(stream(seed, purpose, 1), sizes) for seed in seeds]
+    return Networks(sizes, torch.from_numpy(np.stack(drawn)))
+
+
+def learner(hidden, seeds, rate=1e-4):
+    """Networks whose target differs from the online ones."""
+    online = networks(hidden, seeds)
+    optimiser = Adam.of(online.flat, rate)
+    return DeepQ(online, networks(hidden, seeds, "trees"), optimiser, 0)
+
+
+def filled(seeds, n=200, capacity=200):
+    """A replay of random rows, each seed's own; a tenth of them absorbing."""
+    replay, parts = Replay.empty(len(seeds), capacity, D, A, "cpu"), []
+    for seed in seeds:
+        rng = stream(seed, "data")
+        parts.append(
+            (
+                rng.standard_normal((n, D)) * 2.0,
+                rng.standard_normal((n, D)) * 2.0,
+                rng.standard_normal((n, A)),
+                rng.standard_normal(n) * 2.0,  # errors on both sides of 1
+                np.where(rng.random(n) < 0.1, 0.0, 0.99),
+                rng.integers(A, size=n),
+            )
+        )
+    stacked = [np.stack(column, 1) for column in zip(*parts, strict=True)]
+    for i in range(n):
+        replay.add(*(column[i] for column in stacked))
+    return replay
+
+
+def places(seeds, steps, n=200, batch=BATCH):
+    picked = [stream(s, "replay").integers(n, size=(steps, batch)) for s in seeds]
+    return np.stack(picked, 1)
+
+
+NEXT = np.random.default_rng(1).standard_normal((8, D))
+
+
+def losses_of(update, chosen):
+    """One update's losses; what it says of the next states is checked elsewhere."""
+    return update(chosen[None], NEXT[: len(chosen)])[0]
+
+
+def module(networks, s):
+    """Seed s's network as torch's own."""
+    layers = []
+    for weights, biases in networks.layers:
+        linear = torch.nn.Linear(*weights.shape[1:])
+        linear.weight.data = weights[s].T.clone()
+        linear.bias.data = biases[s, 0].clone()
+        layers += [linear, torch.nn.ReLU()]
+    return torch.nn.Sequential(*layers[:-1])
+
+
+def flattened(module, of=lambda p: p):
+    """Its parameters in the order of `Networks`: weights (in, out), then biases."""
+    linear = [x for x in module if isinstance(x, torch.nn.Linear)]
+    parts = [(of(x.weight).T.flatten(), of(x.bias)) for x in linear]
+    return torch.cat([x.detach() for pair in parts for x in pair])
+
+
+def loss_of(online, target, rows):
+    """torch's loss of one seed's rows (B, width), unpacked by hand."""
+    state, after, base = rows[:, :D], rows[:, D : 2 * D], rows[:, 2 * D : 2 * D + A]
+    fixed, discount, action = rows[:, -3], rows[:, -2], rows[:, -1].long()
+    with torch.no_grad():
+        y = fixed + discount * (target(after) + base).max(1).values
+    values = online(state)[torch.arange(len(rows)), action]
+    return functional.smooth_l1_loss(values, y)
+
+
+@WAYS
+@HIDDEN
+def test_gradients_and_adam_are_torchs(way, hidden):
+    seeds, steps = (0, 1, 5), 5
+    deep, replay, at = learner(hidden, seeds), filled(seeds), places(seeds, steps)
+    single = [(module(deep.online, s), module(deep.target, s)) for s in range(3)]
+    adams = [
+        torch.optim.Adam(one.parameters(), 1e-4, betas=(0.9, 0.999), eps=1e-8)
+        for one, _ in single
+    ]
+    update = way(deep, replay)
+    for step in range(steps):
+        losses = losses_of(update, at[step])
+        for s, (one, target) in enumerate(single):
+            loss = loss_of(one, target, replay.rows[s, at[step, s]])
+            adams[s].zero_grad()
+            loss.backward()
+            if step == 0:
+                gradient = deep.optimiser.moments[0, s] / 0.1
+                expected = flattened(one, lambda p: p.grad)
+                assert (expected.abs() > 1e-3).any()
+                assert torch.allclose(gradient, expected, rtol=1e-4, atol=1e-6)
+            adams[s].step()
+            assert losses[s] == pytest.approx(loss.item(), rel=1e-5)
+            off = (deep.online.flat[s] - flattened(one)).abs().max()
+            assert off < 1e-6, (step, s)
+            assert torch.equal(deep.target.flat[s], flattened(target))
+
+
+@WAYS
+def test_a_batch_meets_the_target_of_now_and_rows_of_now(way):
+    """Bootstrap values are kept: till the target is copied, or a row overwritten."""
+    seeds, steps = (0, 1), 9
+    deep, replay = learner((16,), seeds, rate=0.05), filled(seeds)
+    at = places(seeds, steps, n=20)  # the same rows again and again
+    other = filled((7, 8)).rows
+    update = way(deep, replay)
+    for step in range(steps):
+        if step in (3, 6):
+            deep.copy_target()
+            replay.forget()
+        if step == 5:  # the oldest rows are overwritten, the rest of the ring too
+            for i in range(replay.capacity):
+                cut = np.cumsum([D, D, A, 1, 1])
+                parts = np.split(other[:, i % 200].numpy(), cut, axis=1)
+                *arrays, fixed, discount, action = parts
+                replay.add(*arrays, fixed[:, 0], discount[:, 0], action[:, 0])
+        now = [(module(deep.online, s), module(deep.target, s)) for s in range(2)]
+        # The first batch of a target's time comes with those of the rest of it.
+        batches = at[step : 3 * (step // 3 + 1)] if step in (0, 3, 6) else at[[step]]
+        losses, _ = update(batches, NEXT[:2])
+        for s, (online, target) in enumerate(now):
+            expected = loss_of(online, target, replay.rows[s, at[step, s]]).item()
+            assert losses[s] == pytest.approx(expected, rel=1e-4), (step, s)
+
+
+@HIDDEN
+def test_the_stacked_forward_pass_is_torchs(hidden):
+    many, x = networks(hidden, (0, 3)), torch.randn(2, 7, D, generator=_generator())
+    for s in range(2):
+        expected = module(many, s)(x[s])
+        assert torch.allclose(many.forward(x)[s], expected, atol=1e-5)
+        sizes = np.array(many.sizes)
+        found = compiled.outputs(many.flat.numpy(), sizes, x.numpy())[s]
+        assert np.allclose(found, expected.detach(), atol=1e-5)
+
+
+def _generator():
+    return torch.Generator().manual_seed(0)
+
+
+@pytest.mark.parametrize("batch", [BATCH, 19, 70])
+@HIDDEN
+def test_both_ways_agree_over_fifty_steps(hidden, batch):
+    seeds = (0, 1, 2)
+    replay, at = filled(seeds), places(seeds, 50, batch=batch)
+    one, other = learner(hidden, seeds, 1e-3), learner(hidden, seeds, 1e-3)
+    ways = batched(one, replay), one_by_one(other, replay)
+    began = one.online.flat.clone()
+    for step in range(50):
+        losses = [losses_of(way, at[step]) for way in ways]
+        assert np.allclose(*losses, rtol=1e-3)
+    assert (one.online.flat - began).abs().mean() > 1e-3
+    assert (one.online.flat - other.online.flat).abs().max() < 1e-4
+    assert (one.online.flat - other.online.flat).abs().mean() < 1e-6
+
+
+@WAYS
+@HIDDEN
+def test_stacking_changes_no_bit(way, hidden):
+    seeds, steps = (3, 4, 5, 6, 7), 20
+    many, replay, at = learner(hidden, seeds), filled(seeds), places(seeds, steps)
+    update = way(many, replay)
+    losses = np.array([losses_of(update, at[step]) for step in range(steps)])
+    for s in (0, 3):
+        alone = learner(hidden, seeds[s : s + 1])
+        update = way(alone, filled(seeds[s : s + 1]))
+        own = np.array(
+            [losses_of(update, at[step, s : s + 1]) for step in range(steps)]
+        )
+        assert np.array_equal(own[:, 0], losses[:, s])
+        assert torch.equal(alone.online.flat[0], many.online.flat[s])
+        moments = alone.optimiser.moments[:, 0], many.optimiser.moments[:, s]
+        assert torch.equal(*moments)
+
+
+@HIDDEN
+def test_the_compiled_update_looks_ahead_with_the_new_parameters(hidden):
+    deep, replay, at = learner(hidden, (0, 1)), filled((0, 1)), places((0, 1), 1)
+    _, ahead = one_by_one(deep, replay)(at, NEXT[:2])
+    assert np.array_equal(ahead, deep(NEXT[:2, None], A)[:, 0])
+
+
+def test_on_a_cpu_the_update_is_compiled(monkeypatch):
+    deep, replay = learner((16,), (0,)), filled((0,))
+    called = []
+    monkeypatch.setattr(compiled, "update", lambda *given: called.append(len(given)))
+    losses_of(updater(deep, replay), places((0,), 1)[0])
+    assert called
+
+
+@HIDDEN
+def test_weights_and_biases_fill_their_boxes(hidden):
+    sizes = (D, *hidden, A)
+    drawn = np.stack([xavier(stream(s, "weights", 1), sizes) for s in range(40)])
+    at = 0
+    for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
+        gain = 1.0 if layer == len(hidden) else math.sqrt(2.0)
+        boxes = (
+            (n_in * n_out, gain * math.sqrt(6.0 / (n_in + n_out))),
+            (n_out, 1.0 / math.sqrt(n_in)),
+        )
+        for n, bound in boxes:
+            part, at = drawn[:, at : at + n], at + n
+            assert 0.97 * bound < np.abs(part).max() <= bound * (1.0 + 1e-6)
+            assert part.std() == pytest.approx(bound / math.sqrt(3.0), rel=0.1)
+            assert abs(part.mean()) < 0.15 * bound
+    assert at == drawn.shape[1]
+    assert len(np.unique(drawn[:, 0])) == 40
+
+
+def test_gradients_do_not_leak_where_the_unit_is_off():
+    """All hidden units off: only the output's biases learn."""
+    deep, replay = learner((16,), (0,)), filled((0,))
+    deep.online.layers[0][0][:] = 0.0
+    deep.online.layers[0][1][:] = -1.0
+    for way in (batched, one_by_one):
+        copy = deep.clone()
+        losses_of(way(copy, replay), places((0,), 1)[0])
+        (w1, b1), (w2, b2) = Networks(
+            deep.online.sizes, copy.optimiser.moments[0]
+        ).layers
+        assert not w1.any() and not b1.any() and not w2.any() and b2.any()
+
+
+@WAYS
+def test_a_gradient_that_is_no_number_is_seen_in_the_weights(way):
+    deep, replay = learner((16,), (0, 1)), filled((0, 1))
+    replay.rows[1, :, -3] = math.nan
+    losses = losses_of(way(deep, replay), places((0, 1), 1)[0])
+    assert math.isfinite(losses[0]) and math.isnan(losses[1])
+    assert deep.online.flat[0].isfinite().all()
+    assert deep.online.flat[1].isnan().any()
+
+
+@njit
+def adam(to, gradient):
+    """A step of Adam on arrays (1, n): the gradient is a product of one term."""
+    one, only = np.ones(1, np.float32), np.zeros(1, np.int64)
+    n = to[0].shape[1]
+    tiles.product_adam(to, n, only, 1, only, 1, one, 0, 0, gradient)
+
+
+def test_faded_moments_become_zero_and_not_denormal():
+    smallest, n = np.finfo(np.float32).tiny, 50
+    rng = np.random.default_rng(0)
+    parameters = rng.standard_normal((1, n)).astype(np.float32)
+    first, second = np.zeros((2, 1, n), np.float32)
+    optimiser = Adam.of(torch.zeros(1, n), 1e-4)
+    exact = [parameters.astype(float), np.zeros((1, n)), np.zeros((1, n))]
+    gradient = np.zeros((1, 64), np.float32)  # tiles read beyond n
+    gradient[:, :n] = 10.0 ** rng.uniform(-14, 0, n)
+    nothing = np.zeros_like(gradient)
+    for step in range(1, 3001):
+        now = gradient if step <= 3 else nothing
+        beta1, beta2, *others = optimiser.next_step()
+        constants = (beta1, 1 - beta1, beta2, 1 - beta2, *others)
+        adam((parameters, first, second, *constants), now)
+        for moment in (first, second):
+            assert not ((moment != 0) & (np.abs(moment) < smallest)).any()
+        exact[1] = 0.9 * exact[1] + 0.1 * now[:, :n]
+        exact[2] = 0.999 * exact[2] + 0.001 * now[:, :n].astype(float) ** 2
+        scaled = exact[1] / (1.0 - 0.9**step)
+        spread = np.sqrt(exact[2] / (1.0 - 0.999**step))
+        exact[0] = exact[0] - 1e-4 * scaled / (spread + 1e-8)
+    assert not first.any()
+    assert np.abs(parameters - exact[0]).max() < 1e-6
+
+
+def test_a_deep_q_answers_stacked_and_listed_states_alike():
+    deep = learner((32, 32), (0, 1))
+    states = np.random.default_rng(0).standard_normal((2, 9, D))
+    stacked = deep(states, A)
+    listed = deep([states[0], states[1, :4]], A)
+    assert stacked.dtype == np.float64 and stacked.shape == (2, 9, A)
+    assert np.allclose(stacked[0], listed[0], atol=1e-6)
+    assert np.allclose(stacked[1, :4], listed[1], atol=1e-6)
+    expected = module(deep.online, 1)(torch.from_numpy(states[1]).float())
+    assert np.allclose(stacked[1], expected.detach(), atol=1e-5)
+
+
+def test_a_clone_trains_on_its_own():
+    deep, replay = learner((16,), (0, 1)), filled((0, 1))
+    losses_of(one_by_one(deep, replay), places((0, 1), 1)[0])
+    deep.steps = 7
+    copy = deep.clone()
+    kept = deepcopy((deep.online.flat, deep.target.flat, deep.optimiser.moments))
+    assert (copy.steps, copy.optimiser.steps) == (7, 1)
+    assert torch.equal(copy.optimiser.moments, kept[2])
+    losses_of(one_by_one(copy, replay), places((0, 1), 1)[0])
+    copy.target.flat.zero_()
+    now = deep.online.flat, deep.target.flat, deep.optimiser.moments
+    assert all(torch.equal(a, b) for a, b in zip(now, kept, strict=True))
+    assert not torch.equal(copy.online.flat, deep.online.flat)
+    assert deep.optimiser.steps == 1
