@@ -1,170 +1,168 @@
-"""Two tables that write nothing: what a command line would run, and what is done."""
+"""Tables for the terminal: what a command would run, what is done, what it cost."""
 
 from __future__ import annotations
 
-import heapq
 import math
 from argparse import Namespace
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from bcrl.common import files
+from bcrl.common.identity import Plain
+from bcrl.common.terminal import aligned
 from bcrl.config import vetting
 from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
-from bcrl.run import checkpoints, costs, locks, records, runner
-from bcrl.run.progress import named
+from bcrl.run import checkpoints, costs, records
+from bcrl.run.records import STATES
+from bcrl.run.schedule import Failures, merged, ordered
 
-COMPLETE, RUNNING, FAILED = "complete", "running", "failed"  # as in a seed's JSON
-INTERRUPTED, WAITING = "interrupted", "waiting"
-MOST = 10**6  # seeds in one range; a config can't ask for more
-STATES = (COMPLETE, RUNNING, INTERRUPTED, FAILED, WAITING)
+_MOST = 10**6  # seeds in one range; a config can't name more
 
 
 def dry_run(plans: Sequence[Plan]) -> str:
-    """The jobs that these plans would be now, and what they are expected to cost."""
-    plans, failed = list(runner.merged(plans)), {}
-    work = runner.ordered(plans, failed)
-    begun = {plan.directory: checkpoints.teams(plan) for plan, _ in work}
-    seconds = []  # of one core, of each job
-    for plan, seeds in work:
-        left = 1.0 - begun[plan.directory].get(seeds, 0.0)
-        seconds.append(costs.expected(plan) * len(seeds) * left)
+    """The jobs that these plans would be now, and their expected costs."""
+    plans, failed = merged(plans), Failures()
+    jobs = ordered(plans, failed)
+    seconds = [job.seconds * (1.0 - job.done) for job in jobs]
     rows = [("", "complete", "to do", "jobs", "core min")]
     for plan in plans:
-        jobs = [n for n, (of, _) in enumerate(work) if of is plan]
-        todo = [seed for n in jobs for seed in work[n][1]]
+        own = [n for n, job in enumerate(jobs) if job.plan is plan]
+        todo = records.seed_list([seed for n in own for seed in jobs[n].seeds])
         done = str(len(plan.seeds) - len(records.pending(plan)))
-        cost = _minutes(sum(seconds[n] for n in jobs))
-        where, which = str(plan.directory), _seeds(todo)
-        rows.append((where, done, which, str(len(jobs)), cost))
-    hopeless = [why for lost in failed.values() for why in set(lost.why.values())]
+        cost = _minutes(sum(seconds[n] for n in own))
+        rows.append((str(plan.directory), done, todo, str(len(own)), cost))
+    damaged = [line for p in plans for line in damage(p.directory, p.seeds)]
+    hopeless = [why for reasons in failed.values() for why in set(reasons.values())]
     workers = plans[0].config["workers"]
-    wall = _minutes(_wall(seconds, workers))
-    total = f"{len(work)} jobs, about {_minutes(sum(seconds))} core minutes"
+    wall = _minutes(costs.makespan(seconds, workers))
+    total = f"{len(jobs)} jobs, about {_minutes(sum(seconds))} core minutes"
     last = f"{total}, {wall} min with workers={workers}; nothing was run or written"
-    damaged = [x for plan in plans for x in runner.damage(plan.directory, plan.seeds)]
-    return "\n".join([*_aligned(rows), *damaged, *hopeless, last])
-
-
-def _wall(seconds: Sequence[float], workers: int) -> float:
-    """When the last of the jobs is done that `workers` take in this order."""
-    free = [0.0] * workers
-    for job in seconds:
-        heapq.heapreplace(free, free[0] + job)
-    return max(free)
+    return "\n".join([*aligned(rows), *damaged, *hopeless, last])
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Seeds of a variant that were asked for, and where each stands."""
+class _Variant:
+    """The seeds of a variant, and where each stands."""
 
     directory: Path
     states: dict[int, str]  # by seed: one of `STATES`
-    failed: dict[int, str]  # why
-    undone: float  # seeds' worth of work that is left, but for those that failed
+    undone: float  # seeds' worth of work that is left, without the failed seeds
     seconds: float  # of one core, that this work is expected to take; NaN: unknown
 
     @property
-    def name(self) -> str:
-        """`paper maze BC-FQI`."""
-        return " ".join(self.directory.parts[-3:])
+    def failed(self) -> dict[int, str]:
+        """The seeds that failed, and why."""
+        lost = [seed for seed, state in self.states.items() if state == "failed"]
+        return {s: records.read_facts(self.directory, s)["status"] for s in lost}
 
 
 def status(arguments: Namespace) -> str:
-    """How far everything is that a command line asks for.
+    """The state of all seeds of a command line, as a table.
 
-    If it names nothing but `runs_dir`, everything that was ever begun there.
+    If it names nothing but `runs_dir`, of all seeds that were ever requested there.
     """
     if all(override.startswith("runs_dir=") for override in arguments.overrides):
         any_ = [*arguments.overrides, "env=maze"]  # it is a required choice
         (plan,) = vetting.plans(Namespace(**vars(arguments) | {"overrides": any_}))
-        root = plan.root
-        folders = sorted(path.parent for path in root.glob("*/*/*/config.yaml"))
+        folders = sorted(path.parent for path in plan.root.glob("*/*/*/config.yaml"))
         if not folders:
-            raise BcrlError(f"runs_dir={root}: holds no runs")
-        variants = [_measure(folder, _ever_asked(folder)) for folder in folders]
+            raise BcrlError(f"runs_dir={plan.root}: holds no runs")
+        variants = [_variant(folder, _ever_requested(folder)) for folder in folders]
     else:
-        plans = runner.merged(vetting.plans(arguments))
-        variants = [_measure(p.directory, p.seeds, costs.expected(p)) for p in plans]
+        plans = merged(vetting.plans(arguments))
+        variants = [_variant(p.directory, p.seeds, costs.expected(p)) for p in plans]
     rows = [("", "seeds", *STATES, "done", "core min left")]
-    for asked in variants:
-        counts, n = Counter(asked.states.values()), len(asked.states)
-        done = f"{100 * (1 - (asked.undone + len(asked.failed)) / max(1, n)):.0f} %"
+    reasons: list[str] = []
+    for one in variants:
+        name, number = " ".join(one.directory.parts[-3:]), len(one.states)
+        counts, failed = Counter(one.states.values()), one.failed
+        done = f"{100 * (1 - (one.undone + len(failed)) / max(1, number)):.0f} %"
         cells = [str(counts[state] or "") for state in STATES]
-        rows.append((asked.name, str(n), *cells, done, _minutes(asked.seconds)))
-    total = sum(asked.seconds for asked in variants)
-    rows.append(("in all", *[""] * (len(STATES) + 2), _minutes(total)))
-    reasons = [line for asked in variants for line in _reasons(asked)]
-    return "\n".join([*_aligned(rows), *reasons])
+        rows.append((name, str(number), *cells, done, _minutes(one.seconds)))
+        for why, seeds in records.by_reason(failed):
+            reasons.append(f"{name}, {records.named(seeds)}: {why}")
+        reasons += damage(one.directory, list(one.states))
+    total = _minutes(sum(one.seconds for one in variants))
+    rows.append(("in all", *[""] * (len(STATES) + 2), total))
+    return "\n".join([*aligned(rows), *reasons])
 
 
-def _ever_asked(directory: Path) -> list[int]:
-    """The seeds that a variant's folder was ever asked for, by what those begun say."""
+def damage(directory: Path, seeds: Sequence[int]) -> Iterator[str]:
+    """A line for each way in which files of finished seeds are damaged."""
+    for why, lost in records.by_reason(records.damaged(directory, seeds)):
+        name = f"{' '.join(directory.parts[-3:])}, {records.named(lost)}"
+        yield f"{name}: {why}; a rerun makes {'them' if lost[1:] else 'it'} again"
+
+
+def closing_lines(plans: Sequence[Plan], seconds: float) -> Iterator[str]:
+    """After a run: which variants diverge, and a table of the costs of several plans.
+
+    `seconds`: wall-clock time of this call.
+    """
+    rows = [("", "seeds", "failed", "CPU s per seed", "core min")]
+    total = peak = 0.0
+    for plan in plans:
+        facts = {seed: records.read_facts(plan.directory, seed) for seed in plan.seeds}
+        name = f"{plan.env} {plan.name}"
+        if largest := _diverging(facts.values()):
+            lost = records.named([s for s in facts if facts[s].get("diverging")])
+            which = ", ".join(f"{key} up to {x:.3g}" for key, x in largest.items())
+            yield f"{name}, {lost}: diverges, {which}"
+        spent = [
+            each["cpu_seconds"] for each in facts.values() if "cpu_seconds" in each
+        ]
+        failed = sum(each.get("status") != "complete" for each in facts.values())
+        total += sum(spent)
+        peak = max(peak, *(each.get("peak_memory_mib", 0.0) for each in facts.values()))
+        mean = f"{sum(spent) / max(1, len(spent)):.2f}"
+        rows.append((name, str(len(facts)), str(failed), mean, _minutes(sum(spent))))
+    if len(plans) > 1:
+        yield from aligned([*rows, ("in all", "", "", "", _minutes(total))])
+        call = f"this call: {_minutes(seconds)} min"
+        memory = f"peak memory of a process that trains: {peak:.0f} MiB"
+        yield f"{call} with workers={plans[0].config['workers']}; {memory}"
+
+
+def _diverging(facts: Iterable[Plain]) -> dict[str, float]:
+    """The metrics that diverge in some seed, and their largest magnitudes."""
+    largest: dict[str, float] = {}
+    for found in facts:
+        for name, value in found.get("diverging", {}).items():
+            largest[name] = max(value, largest.get(name, 0.0))
+    return largest
+
+
+def _ever_requested(directory: Path) -> list[int]:
+    """The seeds that were ever requested of a variant, by the JSON of begun ones."""
     seeds: set[int] = set()
     for number in files.seeds_of(directory, "json"):
         try:
             for first, last in records.read_facts(directory, number)["asked"]:
-                seeds.update(range(first, min(last, first + MOST) + 1))
+                seeds.update(range(first, min(last, first + _MOST) + 1))
         except records.MALFORMED:
             continue
     return sorted(seeds)
 
 
-def _measure(directory: Path, seeds: Sequence[int], seconds: float = math.nan) -> Asked:
-    """Where a variant's seeds stand; one is expected to take so many core-seconds.
+def _variant(
+    directory: Path, seeds: Sequence[int], seconds: float = math.nan
+) -> _Variant:
+    """Where a variant's seeds stand; each is expected to take so many core-seconds.
 
-    What those that are complete took counts more.
+    The measured time of complete seeds replaces the expectation.
     """
-    facts = {seed: records.read_facts(directory, seed) for seed in seeds}
-    states = {seed: _state(directory, seed, facts[seed]) for seed in seeds}
-    failed = {s: facts[s]["status"] for s in seeds if states[s] == FAILED}
-    spent = [facts[s].get("cpu_seconds", 0) for s in seeds if states[s] == COMPLETE]
+    states = {seed: records.state(directory, seed) for seed in seeds}
+    done = [seed for seed in seeds if states[seed] == "complete"]
+    spent = [records.read_facts(directory, s).get("cpu_seconds", 0) for s in done]
     begun = checkpoints.shares(directory)
-    left = [s for s in seeds if states[s] not in (COMPLETE, FAILED)]
+    left = [s for s in seeds if states[s] not in ("complete", "failed")]
     undone = sum(1.0 - begun.get(seed, 0.0) for seed in left)
     rate = sum(spent) / len(spent) if spent else seconds
-    return Asked(directory, states, failed, undone, undone * rate if undone else 0.0)
-
-
-def _state(directory: Path, seed: int, facts: Mapping[str, Any]) -> str:
-    """One of `STATES`; what says `running` but has no lock was interrupted."""
-    if locks.is_held(directory, seed):
-        return RUNNING
-    if records.is_complete(directory, seed):
-        return COMPLETE
-    said = str(facts.get("status", WAITING))
-    if said.startswith(FAILED):
-        return FAILED
-    return INTERRUPTED if said == RUNNING else WAITING
-
-
-def _reasons(asked: Asked) -> Iterator[str]:
-    """A line for each reason why seeds have failed, or count no more."""
-    for why in dict.fromkeys(asked.failed.values()):
-        lost = [seed for seed, reason in asked.failed.items() if reason == why]
-        yield f"{asked.name}, {named(lost)}: {why}"
-    yield from runner.damage(asked.directory, list(asked.states))
+    return _Variant(directory, states, undone, undone * rate if undone else 0.0)
 
 
 def _minutes(seconds: float) -> str:
     return "?" if math.isnan(seconds) else f"{seconds / 60:.1f}"
-
-
-def _seeds(seeds: Sequence[int]) -> str:
-    """`0–2, 5`."""
-    ranges = records.ranges(seeds)
-    return ", ".join(f"{a}–{b}" if a < b else str(a) for a, b in ranges)
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Rows as lines: the first column to the left, all others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        row[0].ljust(widths[0])
-        + "".join(f"  {cell:>{w}}" for cell, w in zip(row[1:], widths[1:], strict=True))
-        for row in rows
-    ]
