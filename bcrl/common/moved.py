@@ -72,4 +72,4 @@ class _Moved(Loader):
 def install() -> None:
     """Let imports find the old names."""
     if _Moved not in sys.meta_path:
-        sys.meta_path.insert(0, _Moved)  # type: ignore[arg-type]
+        sys.meta_path.insert(0, _Moved)

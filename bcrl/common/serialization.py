@@ -125,7 +125,7 @@ class _Packer:
 
     def _array(self, array: NDArray) -> list:
         fortran = array.flags.f_contiguous and not array.flags.c_contiguous
-        order = "F" if fortran else "C"
+        order: Any = "F" if fortran else "C"
         flat = np.ascontiguousarray(array.reshape(-1, order=order))
         self.bytes.append(flat.view(np.uint8))
         start, self._length = self._length, self._length + array.nbytes
@@ -162,11 +162,11 @@ class _Unpacker:
         if kind == "object" and what in _STORABLE:
             if fields is None or fields.keys() != set(_fields(_STORABLE[what])):
                 raise ValueError(f"its {what} has other fields than this version's")
-            parts = {key: self.unpack(value) for key, value in fields.items()}
-            return _STORABLE[what](**parts)
+            made = {key: self.unpack(value) for key, value in fields.items()}
+            return _STORABLE[what](**made)
         raise ValueError(f"its structure holds an unknown {kind} {what}")
 
-    def _array(self, start: int, dtype: str, shape: list[int], order: str) -> NDArray:
+    def _array(self, start: int, dtype: str, shape: list[int], order: Any) -> NDArray:
         kind = np.dtype(dtype)
         end = start + math.prod(shape) * kind.itemsize
         if kind.hasobject or min(start, *shape, 0) < 0 or end > len(self.data):

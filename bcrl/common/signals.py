@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import sys
 import threading
 from collections.abc import Iterator
 from types import FrameType
@@ -61,7 +60,7 @@ class Stop:
                 # Not print: the signal may have come in the middle of one.
                 text = f"bcrl: {name}: saving; once more to quit at once\n"
                 with contextlib.suppress(*GONE):
-                    os.write(sys.__stderr__.fileno(), text.encode())
+                    os.write(2, text.encode())
             came.add(number)
             self.ask()
 

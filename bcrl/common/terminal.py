@@ -6,6 +6,7 @@ import contextlib
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 #: Errors of a closed pipe, terminal or stream.
 GONE = (OSError, ValueError, AttributeError)
@@ -28,7 +29,8 @@ def ready() -> None:
             # By its usual number, which child processes inherit.
             stream = open(number, mode, encoding="utf-8", closefd=False)  # noqa: SIM115
             setattr(sys, name, stream)
-    for stream in (sys.stdout, sys.stderr):
+    streams: tuple[Any, ...] = (sys.stdout, sys.stderr)
+    for stream in streams:
         with contextlib.suppress(*GONE):  # a stream of a test's or a notebook's
             stream.reconfigure(errors="backslashreplace")
     # numba can't be imported with another number, and our loops must be compiled.

@@ -108,7 +108,7 @@ def state(directory: Path, seed: int) -> str:
 
 def _inspect(directory: Path, seed: int) -> tuple[bool, str]:
     """As `_inspected`, which reads the files once for each of their states."""
-    stamps = []
+    stamps: list[object] = []
     for suffix in ("json", "csv", "npz"):
         try:
             about = seed_path(directory, seed, suffix).stat()
