@@ -22,6 +22,7 @@ from bcrl.run.schedule import merged, ordered
 from bcrl.run.workers import Died, cores, do_jobs
 from tests.conftest import arguments, plan, plans
 from tests.made_up import made_up_plan, write_seeds
+from tests.run.light import work
 from tests.run.runs import FQI, MAZE, results, run
 
 
@@ -141,14 +142,6 @@ def test_a_bar_that_cannot_be_is_lines(monkeypatch, capsys):
 
 
 # --- processes ---
-
-
-def work(number: int, report, stop):
-    """What the workers below do."""
-    report(number)
-    if number == 1:
-        os._exit(3)
-    return 10 * number
 
 
 def test_a_process_that_dies_loses_its_job_and_is_replaced():
