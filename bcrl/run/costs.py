@@ -47,8 +47,8 @@ def makespan(seconds: Iterable[float], workers: int) -> float:
     return max(free)
 
 
-def needed_memory(plan: Plan) -> int:
-    """Bytes that the episodes or replays of seeds that train together may take."""
+def memory_note(plan: Plan) -> str | None:
+    """A warning if the data of seeds that train together may not fit into memory."""
     seeds, most = min(plan.lockstep, len(plan.seeds)), 0
     for stage in plan.stages:
         env, learner = stage.env, stage.learner
@@ -57,11 +57,13 @@ def needed_memory(plan: Plan) -> int:
         states = 2 * 8 * episodes * (env.horizon + 1) * env.state_dim  # and a copy
         row = 4 * (2 * env.state_dim + env.n_actions + 3)
         most = max(most, seeds * (states + row * getattr(learner, "replay_size", 0)))
-    return most
-
-
-def available_memory() -> int:
-    """Bytes of memory that this process may still take, as far as is known."""
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    return there if limit == resource.RLIM_INFINITY else min(there, limit)
+    there = there if limit == resource.RLIM_INFINITY else min(there, limit)
+    if most <= there:
+        return None
+    sizes = f"up to {most / 2**30:.1f} GiB of memory, of {there / 2**30:.1f} GiB"
+    less = (
+        "seeds.lockstep=1, fewer episodes, a smaller replay or observations take less"
+    )
+    return f"the data of a batch take {sizes}; {less}"

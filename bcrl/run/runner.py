@@ -97,11 +97,8 @@ def _prepare(plan: Plan, quiet: bool) -> None:
     locks.tidy(plan.directory)
     checkpoints.remove_done(plan)
     name = f"{plan.env} {plan.name}"
-    needed, there = costs.needed_memory(plan), costs.available_memory()
-    if needed > there:
-        few = "seeds.lockstep=1, fewer episodes, a smaller replay or observations"
-        sizes = f"up to {needed / 2**30:.1f} GiB of memory, of {there / 2**30:.1f} GiB"
-        say(f"{name}: the data of a batch take {sizes}; {few} take less")
+    if note := costs.memory_note(plan):
+        say(f"{name}: {note}")
     for line in status.damage(plan.directory, plan.seeds):
         say(f"bcrl: {line}")
     done = len(plan.seeds) - len(records.pending(plan))

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from argparse import Namespace
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from bcrl.common import files
@@ -43,22 +42,6 @@ def dry_run(plans: Sequence[Plan]) -> str:
     return "\n".join([*aligned(rows), *damaged, *hopeless, last])
 
 
-@dataclass(frozen=True)
-class _Variant:
-    """The seeds of a variant, and where each stands."""
-
-    directory: Path
-    states: dict[int, str]  # by seed: one of `STATES`
-    undone: float  # seeds' worth of work that is left, without the failed seeds
-    seconds: float  # of one core, that this work is expected to take; NaN: unknown
-
-    @property
-    def failed(self) -> dict[int, str]:
-        """The seeds that failed, and why."""
-        lost = [seed for seed, state in self.states.items() if state == "failed"]
-        return {s: records.read_facts(self.directory, s)["status"] for s in lost}
-
-
 def status(arguments: Namespace) -> str:
     """The state of all seeds of a command line, as a table.
 
@@ -70,24 +53,43 @@ def status(arguments: Namespace) -> str:
         folders = sorted(path.parent for path in plan.root.glob("*/*/*/config.yaml"))
         if not folders:
             raise BcrlError(f"runs_dir={plan.root}: holds no runs")
-        variants = [_variant(folder, _ever_requested(folder)) for folder in folders]
+        asked = [(folder, _ever_requested(folder), math.nan) for folder in folders]
     else:
         plans = merged(vetting.plans(arguments))
-        variants = [_variant(p.directory, p.seeds, costs.expected(p)) for p in plans]
-    rows = [("", "seeds", *STATES, "done", "core min left")]
-    reasons: list[str] = []
-    for one in variants:
-        name, number = " ".join(one.directory.parts[-3:]), len(one.states)
-        counts, failed = Counter(one.states.values()), one.failed
-        done = f"{100 * (1 - (one.undone + len(failed)) / max(1, number)):.0f} %"
+        asked = [(p.directory, p.seeds, costs.expected(p)) for p in plans]
+    rows, total, reasons = [["", "seeds", *STATES, "done", "core min left"]], 0.0, []
+    for directory, seeds, expected in asked:
+        facts = {seed: records.read_facts(directory, seed) for seed in seeds}
+        states = {seed: records.state(directory, seed) for seed in seeds}
+        failed = {s: facts[s]["status"] for s in seeds if states[s] == "failed"}
+        undone, left = _left(directory, facts, states, expected)
+        counts = Counter(states.values())
         cells = [str(counts[state] or "") for state in STATES]
-        rows.append((name, str(number), *cells, done, _minutes(one.seconds)))
-        for why, seeds in records.by_reason(failed):
-            reasons.append(f"{name}, {records.named(seeds)}: {why}")
-        reasons += damage(one.directory, list(one.states))
-    total = _minutes(sum(one.seconds for one in variants))
-    rows.append(("in all", *[""] * (len(STATES) + 2), total))
+        done = f"{100 * (1 - (undone + len(failed)) / max(1, len(seeds))):.0f} %"
+        name = " ".join(directory.parts[-3:])
+        rows.append([name, str(len(seeds)), *cells, done, _minutes(left)])
+        total += left
+        for why, lost in records.by_reason(failed):
+            reasons.append(f"{name}, {records.named(lost)}: {why}")
+        reasons += damage(directory, seeds)
+    rows.append(["in all", *[""] * (len(STATES) + 2), _minutes(total)])
     return "\n".join([*aligned(rows), *reasons])
+
+
+def _left(
+    directory: Path, facts: Mapping[int, Plain], states: Mapping[int, str], each: float
+) -> tuple[float, float]:
+    """The work that is left, in seeds and in core-seconds; NaN: unknown.
+
+    Without seeds that failed. A seed takes the mean of the complete ones, or `each`.
+    """
+    begun = checkpoints.shares(directory)
+    over = ("complete", "failed")
+    undone = sum(1.0 - begun.get(s, 0.0) for s in states if states[s] not in over)
+    done = [s for s in states if states[s] == "complete"]
+    if done:
+        each = sum(facts[s].get("cpu_seconds", 0) for s in done) / len(done)
+    return undone, undone * each if undone else 0.0
 
 
 def damage(directory: Path, seeds: Sequence[int]) -> Iterator[str]:
@@ -107,10 +109,10 @@ def closing_lines(plans: Sequence[Plan], seconds: float) -> Iterator[str]:
     for plan in plans:
         facts = {seed: records.read_facts(plan.directory, seed) for seed in plan.seeds}
         name = f"{plan.env} {plan.name}"
-        if largest := _diverging(facts.values()):
-            lost = records.named([s for s in facts if facts[s].get("diverging")])
-            which = ", ".join(f"{key} up to {x:.3g}" for key, x in largest.items())
-            yield f"{name}, {lost}: diverges, {which}"
+        lost = [seed for seed in facts if facts[seed].get("diverging")]
+        if lost:
+            which = sorted({key for seed in lost for key in facts[seed]["diverging"]})
+            yield f"{name}, {records.named(lost)}: {', '.join(which)} diverges"
         spent = [
             each["cpu_seconds"] for each in facts.values() if "cpu_seconds" in each
         ]
@@ -126,15 +128,6 @@ def closing_lines(plans: Sequence[Plan], seconds: float) -> Iterator[str]:
         yield f"{call} with workers={plans[0].config['workers']}; {memory}"
 
 
-def _diverging(facts: Iterable[Plain]) -> dict[str, float]:
-    """The metrics that diverge in some seed, and their largest magnitudes."""
-    largest: dict[str, float] = {}
-    for found in facts:
-        for name, value in found.get("diverging", {}).items():
-            largest[name] = max(value, largest.get(name, 0.0))
-    return largest
-
-
 def _ever_requested(directory: Path) -> list[int]:
     """The seeds that were ever requested of a variant, by the JSON of begun ones."""
     seeds: set[int] = set()
@@ -145,23 +138,6 @@ def _ever_requested(directory: Path) -> list[int]:
         except records.MALFORMED:
             continue
     return sorted(seeds)
-
-
-def _variant(
-    directory: Path, seeds: Sequence[int], seconds: float = math.nan
-) -> _Variant:
-    """Where a variant's seeds stand; each is expected to take so many core-seconds.
-
-    The measured time of complete seeds replaces the expectation.
-    """
-    states = {seed: records.state(directory, seed) for seed in seeds}
-    done = [seed for seed in seeds if states[seed] == "complete"]
-    spent = [records.read_facts(directory, s).get("cpu_seconds", 0) for s in done]
-    begun = checkpoints.shares(directory)
-    left = [s for s in seeds if states[s] not in ("complete", "failed")]
-    undone = sum(1.0 - begun.get(seed, 0.0) for seed in left)
-    rate = sum(spent) / len(spent) if spent else seconds
-    return _Variant(directory, states, undone, undone * rate if undone else 0.0)
 
 
 def _minutes(seconds: float) -> str:

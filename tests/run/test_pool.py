@@ -252,4 +252,4 @@ def test_a_variant_that_diverges_is_named_at_the_end(tmp_path):
         write_seeds(p, lambda seed, table=table: pd.DataFrame(table))
         lines.append(list(status.closing_lines([p], 1.0)))
     assert lines[0] == []
-    assert "hill SBC-FQI, seeds 0–2" in lines[1][0] and "1.3e+03" in lines[1][0]
+    assert "hill SBC-FQI, seeds 0–2: q_error" in lines[1][0]
