@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from bcrl.config import shell, vetting
-from bcrl.run import status as overview
+from bcrl.run import status
 
 ROOT = Path(__file__).parents[1]
 #: tests/test_other_packages.py runs this section's commands.
@@ -32,7 +32,7 @@ def test_every_command_would_run(page, line, tmp_path, monkeypatch):
     words = shlex.split(line, comments=True)[1:]
     asked = shell.parser().parse_intermixed_args(words)
     if not asked.status:
-        assert "nothing was run" in overview.dry_run(vetting.plans(asked))
+        assert "nothing was run" in status.dry_run(vetting.plans(asked))
 
 
 def test_links_lead_somewhere():

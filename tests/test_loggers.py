@@ -14,7 +14,7 @@ from bcrl.common.signals import Interrupted
 from bcrl.errors import ConfigError
 from bcrl.report.integrity import check_tree
 from bcrl.results import loggers
-from bcrl.run import runner
+from bcrl.run import job, runner
 from tests.conftest import plan
 
 BC = ("env=maze", "variant=BC", "scale=smoke", "seeds.count=2", "progress=none")
@@ -94,25 +94,21 @@ def test_steps_are_logged_and_gaps_left_out(tmp_path):
 
 
 def test_an_interrupted_run_logs_nothing_twice(tmp_path, monkeypatch):
-    """Stopped after a while, gone on with in a new event file."""
-    from bcrl.run import job as training
+    """A run that stops after a while resumes with a new event file."""
+    measure, train, stops, seen = job._Training.measure, job.train, [], []
 
-    look, seen = training._measure, []
-
-    def counted(probe, now, session, log):
-        look(probe, now, session, log)
-        seen.append(now.count)
+    def counted(training, snapshot):
+        measure(training, snapshot)
+        seen.append(snapshot.count)
         if len(seen) == 7:
             stops[0].ask()
 
-    stops = []
-    train = training.train
-    monkeypatch.setattr(training, "_look", counted)
-    monkeypatch.setattr(
-        training,
-        "train",
-        lambda job, tick, stop: stops.append(stop) or train(job, tick, stop),
-    )
+    def noted(some, tick, stop):
+        stops.append(stop)
+        return train(some, tick, stop)
+
+    monkeypatch.setattr(job._Training, "measure", counted)
+    monkeypatch.setattr(job, "train", noted)
     arguments = (*BC, "logger=tensorboard")
     with pytest.raises(Interrupted):
         run(tmp_path, *arguments)

@@ -51,7 +51,7 @@ class Sick:
 
     def _spoilt(self, fit):
         if self.way == "raises":
-            raise RuntimeError("no luck\ntoday")
+            raise RuntimeError("a broken\npart")
         if self.way == "memory":
             raise MemoryError
         if self.way == "shape":
@@ -106,7 +106,7 @@ def test_a_regressor_that_fails_one_seed_fails_that_seed_alone(env, sick, transf
         assert set(reasons[3]) == {1} and np.isfinite(some[3][0].probed_q[1]).all()
     why = failed[-1][1]
     assert why.startswith("algorithm.regressor=Sick(") and "\n" not in why
-    words = {"raises": "RuntimeError: no luck today", "memory": "memory"}
+    words = {"raises": "RuntimeError: a broken part", "memory": "memory"}
     words |= {"shape": "1), expected (", "predict": "KeyError"}
     assert words.get(sick.way, "finite") in why
     if sick.way in ("raises", "memory", "predict"):

@@ -22,7 +22,7 @@ from tests.conftest import plans
 from tests.run import cluster
 
 SMALL = ("scale=smoke", "scale.max_iterations=20", "checkpoint_every=0.01", "tag=x")
-SMALL += ("algorithm.regressor.trees=150",)  # seconds a job: time to disturb it
+SMALL += ("algorithm.regressor.trees=150",)  # a job takes seconds: time to disturb it
 SWEEP = ("experiment=fig2", *SMALL)
 PROGRAM = "import sys; from bcrl.cli import main; sys.argv[0] = 'bcrl'; main()"
 LIMIT = 120.0  # seconds in which anything waited for must happen
