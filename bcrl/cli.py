@@ -18,6 +18,7 @@ from bcrl.common.files import make_directory
 from bcrl.common.signals import EXIT_CODE, Interrupted, heard
 from bcrl.common.terminal import ready, say, show
 from bcrl.config import guard, shell
+from bcrl.config.describe import describe
 from bcrl.config.hydra_compose import CONF, CONFIG_NAME
 from bcrl.errors import BcrlError
 
@@ -37,6 +38,9 @@ def main() -> None:
             arguments = shell.arguments()
             if arguments.help:
                 show(shell.manual(arguments.config_dir))
+                return
+            if arguments.describe is not None:
+                show(describe(arguments.describe))
                 return
             if plans := _vet(arguments):
                 make_directory(plans[0].root, "runs_dir")

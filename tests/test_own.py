@@ -1,4 +1,4 @@
-"""What docs/own.md adds from outside the package, by its own files and commands."""
+"""What docs/howto/own.md adds from outside the package, by its files and commands."""
 
 import os
 import re
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-DOC = (Path(__file__).parents[1] / "docs" / "own.md").read_text()
+DOC = (Path(__file__).parents[1] / "docs" / "howto" / "own.md").read_text()
 #: Each block of a file, whole, by the path that one of its first lines names.
 FILES = [
     (name, text)

@@ -1,4 +1,4 @@
-"""Environments of other packages learn by the very commands of docs/gymnasium.md."""
+"""Environments of other packages learn by the commands of docs/howto/other_packages.md."""
 
 import importlib.util
 import os
@@ -11,11 +11,8 @@ import pytest
 from bcrl.run import records, runner
 from tests.conftest import plans
 
-SECTION = re.search(
-    r"## Environments of other packages\n(.*?)\n## ",
-    (Path(__file__).parents[2] / "docs" / "gymnasium.md").read_text(encoding="utf-8"),
-    re.S,
-)[1]
+PAGE = Path(__file__).parents[2] / "docs" / "howto" / "other_packages.md"
+SECTION = PAGE.read_text(encoding="utf-8")
 COMMANDS = {
     re.search(r"env\.id=(?:\w+:)?(\S+)", line)[1]: shlex.split(line)
     for line in re.findall(r"^bcrl .*$", SECTION, re.M)
