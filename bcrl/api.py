@@ -17,7 +17,6 @@ import pandas as pd
 from tqdm import tqdm
 
 from bcrl.common import compiling
-from bcrl.common.files import seed_path, seeds_of
 from bcrl.config.rules import course
 from bcrl.config.variant import Composition, order_of
 from bcrl.envs import Env, check_tasks, is_simulated
@@ -43,6 +42,7 @@ from bcrl.learning.transfer import (
 from bcrl.q.regressors.ours import ForestRegressor as Forest
 from bcrl.q.regressors.ours import Tabular
 from bcrl.q.regressors.scikit import Sklearn
+from bcrl.results.read import read_folder
 from bcrl.run.workers import cores
 
 __all__ = ["CarOnHill", "Gymnasium", "LinearSystem", "Maze", "read", "run", "stages"]
@@ -168,9 +168,4 @@ def _rows(
 
 def read(folder: str | Path) -> pd.DataFrame:
     """The seeds that `bcrl` has recorded in a run's folder, as `run` gives them."""
-    numbers = seeds_of(Path(folder), "csv")
-    if not numbers:
-        raise BcrlError(f"{folder}: there is no seed_*.csv")
-    found = {n: pd.read_csv(seed_path(Path(folder), n, "csv")) for n in numbers}
-    frame = pd.concat(found, names=["seed", None]).reset_index("seed")
-    return frame.reset_index(drop=True)
+    return read_folder(folder)

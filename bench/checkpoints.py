@@ -12,8 +12,8 @@ import tempfile
 import time
 from argparse import Namespace
 
-from bcrl.common.files import seed_path
 from bcrl.config import schema, vetting
+from bcrl.results.layout import seed_path
 from bcrl.run import checkpoints, runner
 
 CHOICES = {

@@ -50,18 +50,6 @@ def write_text(path: Path, text: str) -> Path:
     return write_atomically(path, lambda handle: handle.write(text.encode()))
 
 
-def seed_path(directory: Path, seed: int, suffix: str) -> Path:
-    """`seed_0007.csv` and its companions."""
-    return directory / f"seed_{seed:04d}.{suffix}"
-
-
-def seeds_of(directory: Path, suffix: str) -> list[int]:
-    """The seeds, by number, of which a folder has files; other files are ignored."""
-    stems = (path.stem.removeprefix("seed_") for path in directory.glob("seed_*"))
-    seeds = sorted({int(stem) for stem in stems if stem.isdecimal()})
-    return [seed for seed in seeds if seed_path(directory, seed, suffix).exists()]
-
-
 def user_folder(variable: str, usual: str) -> Path | None:
     """A folder of the user's: XDG's `variable` if absolute, else `usual` at home.
 

@@ -16,6 +16,7 @@ from bcrl.common.files import write_atomically
 from bcrl.common.identity import identity
 from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
+from bcrl.results.layout import CHECKPOINT
 from bcrl.run.origin import LIBRARIES
 from bcrl.run.records import is_complete
 
@@ -44,7 +45,7 @@ def load_checkpoint(plan: Plan, seeds: Sequence[int], given: Sequence[Any]) -> A
 def checkpoint_path(plan: Plan, seeds: Sequence[int]) -> Path:
     """The file of a batch, named by its first seed and a hash of all its seeds."""
     code = hashlib.sha256(repr(tuple(seeds)).encode()).hexdigest()[:8]
-    return plan.directory / f"checkpoint_{seeds[0]:04d}_{code}.npz"
+    return plan.directory / f"{CHECKPOINT}{seeds[0]:04d}_{code}.npz"
 
 
 def batches(plan: Plan) -> dict[tuple[int, ...], float]:
@@ -82,7 +83,7 @@ def remove_done(plan: Plan) -> None:
 
 
 def _paths(directory: Path) -> list[Path]:
-    return sorted(directory.glob("checkpoint_*.npz"))
+    return sorted(directory.glob(f"{CHECKPOINT}*.npz"))
 
 
 def _read_about(path: Path) -> dict[str, Any]:

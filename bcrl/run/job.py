@@ -24,6 +24,7 @@ from bcrl.evaluation.step_metrics import StepProbe
 from bcrl.learning.rollout import success_of
 from bcrl.learning.stage import CurriculumRun, SeedBatch, Snapshot
 from bcrl.results import loggers
+from bcrl.results.layout import COMPLETE, RUNNING
 from bcrl.run import checkpoints, records
 from bcrl.run.locks import Lock, claimed
 from bcrl.run.progress import Tick
@@ -142,7 +143,7 @@ class _Training:
         host = {"host": socket.gethostname(), "pid": os.getpid()}
         new = _incomplete(self.plan, self.seeds)
         for seed in new:
-            records.write_status(self.plan, seed, "running", host)
+            records.write_status(self.plan, seed, RUNNING, host)
         length, saved = self.plan.length, time.monotonic()
         for pause in self.run:
             ends = isinstance(pause, Snapshot) and pause.last_of_stage
@@ -228,7 +229,7 @@ class _Training:
         for place, seed in enumerate(self.seeds):
             if seed not in new:
                 continue
-            arrays, status = self.probe.arrays(place), "complete"
+            arrays, status = self.probe.arrays(place), COMPLETE
             if why := progress.failed.get(place) or self.probe.failed.get(place):
                 failed[seed], status = why, f"failed: {why}"
                 say(f"{plan.env} {plan.name}: seed {seed} {status}")

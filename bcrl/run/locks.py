@@ -17,6 +17,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from bcrl.errors import BcrlError
+from bcrl.results.layout import CHECKPOINT, SEED, seed_name
 
 
 class Lock:
@@ -45,7 +46,7 @@ class Lock:
             self.path.write_text(f"process {os.getpid()} on {socket.gethostname()}")
             self._file = os.stat(self.path)
         # A batch's checkpoint belongs to its first seed.
-        for start in (f"{self.name}.", f"{self.name}_".replace("seed", "checkpoint")):
+        for start in (f"{self.name}.", f"{self.name}_".replace(SEED, CHECKPOINT)):
             for left in self.folder.glob(f".{start}*.tmp"):
                 left.unlink(missing_ok=True)
         return True
@@ -75,7 +76,7 @@ class Lock:
 
 def seed_lock(folder: Path, seed: int) -> Lock:
     """The lock of a seed's files."""
-    return Lock(folder, f"seed_{seed:04d}")
+    return Lock(folder, seed_name(seed))
 
 
 def is_held(folder: Path, seed: int) -> bool:

@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 
 from bcrl.common.divergence import diverging
 from bcrl.common.files import (
-    is_intact,
     make_directory,
     sealed,
-    seed_path,
     sha256,
     write_atomically,
     write_text,
@@ -26,12 +24,25 @@ from bcrl.common.files import (
 from bcrl.common.identity import Plain, differences, identity
 from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
+from bcrl.results.layout import (
+    COMPLETE,
+    CONFIG,
+    FAILED,
+    RUNNING,
+    SCHEMA,
+    SUFFIXES,
+    ranges,
+    seed_name,
+    seed_path,
+    spelled,
+    state_of,
+)
+from bcrl.results.read import BadFile, read_document, read_recorded
 from bcrl.run import locks
 
-SCHEMA = 2  # raised when a file's meaning changes
-MALFORMED = (ValueError, LookupError, TypeError, AttributeError)  # of a file's content
+_MALFORMED = (ValueError, LookupError, TypeError, AttributeError)  # file's content
 #: Where a seed may stand; the first two and `failed: why` stand in its JSON.
-STATES = ("complete", "running", "interrupted", "failed", "waiting")
+STATES = (COMPLETE, RUNNING, "interrupted", FAILED, "waiting")
 
 
 def check_directory(plan: Plan) -> None:
@@ -42,13 +53,13 @@ def check_directory(plan: Plan) -> None:
         raise BcrlError(f"runs_dir: {existing} is a file; name another folder")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise BcrlError(f"runs_dir: no permission to write in {existing}")
-    present = directory / "config.yaml"
+    present = directory / CONFIG
     if not present.exists():
         return
     try:
         before = yaml.safe_load(present.read_text("utf-8"))
         changed = differences(before, plan.config)
-    except (yaml.YAMLError, OSError, *MALFORMED) as error:
+    except (yaml.YAMLError, OSError, *_MALFORMED) as error:
         raise BcrlError(f"{present} can't be read ({error}); move it away") from error
     if changed:
         lines = [f"  {k}: there {a!r}, here {b!r}" for k, (a, b) in changed.items()]
@@ -67,10 +78,10 @@ def make_run_directory(plan: Plan) -> None:
         raise BcrlError(f"{lock.path} is held by {lock.holder()} for a minute")
     try:
         check_directory(plan)
-        if not (directory / "config.yaml").exists():
+        if not (directory / CONFIG).exists():
             config = identity(plan.config)
             text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
-            write_text(directory / "config.yaml", text)
+            write_text(directory / CONFIG, text)
     finally:
         lock.release()
 
@@ -97,48 +108,37 @@ def damaged(directory: Path, seeds: Sequence[int]) -> dict[int, str]:
 def state(directory: Path, seed: int) -> str:
     """One of `STATES`; a seed that is `running` without a lock was interrupted."""
     if locks.is_held(directory, seed):
-        return "running"
+        return RUNNING
     if is_complete(directory, seed):
-        return "complete"
-    noted = str(read_facts(directory, seed).get("status"))
-    return {"running": "interrupted", "failed": "failed"}.get(
-        noted.partition(":")[0], "waiting"
-    )
+        return COMPLETE
+    noted = str(read_facts(directory, seed).get("status")).partition(":")[0]
+    return {RUNNING: "interrupted", FAILED: FAILED}.get(noted, "waiting")
 
 
 def _inspect(directory: Path, seed: int) -> tuple[bool, str]:
     """As `_inspected`, which reads the files once for each of their states."""
     stamps: list[object] = []
-    for suffix in ("json", "csv", "npz"):
+    for suffix in SUFFIXES:
         try:
             about = seed_path(directory, seed, suffix).stat()
             stamps.append((about.st_ino, about.st_size, about.st_ctime_ns))
         except OSError:
             stamps.append(None)
-    return _inspected(directory, seed, *stamps)
+    return _inspected(directory, seed, *stamps) if any(stamps) else (False, "")
 
 
 @lru_cache(maxsize=2**16)
 def _inspected(directory: Path, seed: int, *stamps: object) -> tuple[bool, str]:
-    """Whether a seed is complete, and what is wrong with finished files."""
-    if stamps[0] is None:
-        return False, "the JSON is missing" if any(stamps) else ""
-    facts = read_facts(directory, seed)
-    if not facts or not is_intact(facts):
-        return False, "the JSON was changed or damaged after it was written"
-    if facts.get("schema") != SCHEMA or facts.get("status") != "complete":
-        return False, ""
-    name = "@".join(filter(None, (facts.get("variant"), facts.get("tag"))))
-    home = facts.get("scale"), facts.get("env"), name
-    if (facts.get("seed"), *home) != (seed, *directory.parts[-3:]):
-        return False, "the JSON is another run's"
-    for suffix in ("csv", "npz"):
-        try:
-            data = seed_path(directory, seed, suffix).read_bytes()
-        except OSError as error:
-            return False, f"the {suffix.upper()} can't be read ({error.strerror})"
-        if sha256(data) != facts.get("sha256", {}).get(suffix):
-            return False, f"the {suffix.upper()} was changed after it was written"
+    """Whether a seed is complete, and what is wrong with its files."""
+    try:
+        document = read_document(directory, seed)
+        if state_of(document) != COMPLETE:
+            return False, ""
+        for suffix in ("csv", "npz"):
+            read_recorded(seed_path(directory, seed, suffix), document)
+    except BadFile as error:
+        what = error.finding.what.replace(f"{seed_name(seed)}.json", "the JSON")
+        return False, f"the {error.finding.path.suffix[1:].upper()} {what}"
     return True, ""
 
 
@@ -165,7 +165,7 @@ def write_status(plan: Plan, seed: int, status: str, facts: Plain) -> None:
         "env": plan.env,
         "variant": plan.variant,
         "tag": plan.tag,
-        "asked": seed_ranges(plan.asked),
+        "asked": ranges(plan.asked),
         **facts,
         "config": config,
     }
@@ -200,25 +200,9 @@ def write_seed(
 # --- seeds in words ---
 
 
-def seed_ranges(seeds: Sequence[int]) -> list[list[int]]:
-    """Seeds as [first, last] of each run of successive ones."""
-    ranges: list[list[int]] = []
-    for seed in sorted(seeds):
-        if ranges and seed == ranges[-1][1] + 1:
-            ranges[-1][1] = seed
-        else:
-            ranges.append([seed, seed])
-    return ranges
-
-
-def seed_list(seeds: Sequence[int]) -> str:
-    """`0–2, 5`."""
-    return ", ".join(f"{a}–{b}" if a < b else str(a) for a, b in seed_ranges(seeds))
-
-
 def named(seeds: Sequence[int]) -> str:
     """`seed 7`, `seeds 0–2, 5`."""
-    return f"seed{'s' * (len(seeds) > 1)} {seed_list(seeds)}"
+    return f"seed{'s' * (len(seeds) > 1)} {spelled(seeds)}"
 
 
 def by_reason(reasons: Mapping[int, str]) -> Iterator[tuple[str, list[int]]]:

@@ -14,6 +14,7 @@ from bcrl.common.terminal import say
 from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
 from bcrl.evaluation import oracle
+from bcrl.results.layout import RUNNING
 from bcrl.run import checkpoints, costs, job, locks, records, status
 from bcrl.run.origin import run_origin
 from bcrl.run.progress import Progress, Tick
@@ -86,7 +87,7 @@ def _why_incomplete(plan: Plan, seed: int) -> str:
     if why := records.damaged(plan.directory, [seed]).get(seed):
         return why
     noted = records.read_facts(plan.directory, seed).get("status", "never begun")
-    if noted == "running":
+    if noted == RUNNING:
         return "begun, but its process died or was stopped"
     return noted.removeprefix("failed: ")
 

@@ -6,19 +6,26 @@ import math
 from argparse import Namespace
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
-from bcrl.common import files
 from bcrl.common.identity import Plain
 from bcrl.common.terminal import aligned
 from bcrl.config import vetting
 from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
+from bcrl.results.layout import (
+    COMPLETE,
+    CONFIG,
+    FAILED,
+    requested,
+    seeds_of,
+    spelled,
+)
+from bcrl.results.read import read_document
 from bcrl.run import checkpoints, costs, records
 from bcrl.run.records import STATES
 from bcrl.run.schedule import Failures, merged, ordered
-
-_MOST = 10**6  # seeds in one range; a config can't name more
 
 
 def dry_run(plans: Sequence[Plan]) -> str:
@@ -29,7 +36,7 @@ def dry_run(plans: Sequence[Plan]) -> str:
     rows = [("", "complete", "to do", "jobs", "core min")]
     for plan in plans:
         own = [n for n, job in enumerate(jobs) if job.plan is plan]
-        todo = records.seed_list([seed for n in own for seed in jobs[n].seeds])
+        todo = spelled([seed for n in own for seed in jobs[n].seeds])
         done = str(len(plan.seeds) - len(records.pending(plan)))
         cost = _minutes(sum(seconds[n] for n in own))
         rows.append((str(plan.directory), done, todo, str(len(own)), cost))
@@ -50,7 +57,7 @@ def status(arguments: Namespace) -> str:
     if all(override.startswith("runs_dir=") for override in arguments.overrides):
         any_ = [*arguments.overrides, "env=maze"]  # it is a required choice
         (plan,) = vetting.plans(Namespace(**vars(arguments) | {"overrides": any_}))
-        folders = sorted(path.parent for path in plan.root.glob("*/*/*/config.yaml"))
+        folders = sorted(path.parent for path in plan.root.glob(f"*/*/*/{CONFIG}"))
         if not folders:
             raise BcrlError(f"runs_dir={plan.root}: holds no runs")
         asked = [(folder, _ever_requested(folder), math.nan) for folder in folders]
@@ -61,7 +68,7 @@ def status(arguments: Namespace) -> str:
     for directory, seeds, expected in asked:
         facts = {seed: records.read_facts(directory, seed) for seed in seeds}
         states = {seed: records.state(directory, seed) for seed in seeds}
-        failed = {s: facts[s]["status"] for s in seeds if states[s] == "failed"}
+        failed = {s: facts[s]["status"] for s in seeds if states[s] == FAILED}
         undone, left = _left(directory, facts, states, expected)
         counts = Counter(states.values())
         cells = [str(counts[state] or "") for state in STATES]
@@ -84,9 +91,9 @@ def _left(
     Without seeds that failed. A seed takes the mean of the complete ones, or `each`.
     """
     begun = checkpoints.shares(directory)
-    over = ("complete", "failed")
+    over = (COMPLETE, FAILED)
     undone = sum(1.0 - begun.get(s, 0.0) for s in states if states[s] not in over)
-    done = [s for s in states if states[s] == "complete"]
+    done = [s for s in states if states[s] == COMPLETE]
     if done:
         each = sum(facts[s].get("cpu_seconds", 0) for s in done) / len(done)
     return undone, undone * each if undone else 0.0
@@ -116,7 +123,7 @@ def closing_lines(plans: Sequence[Plan], seconds: float) -> Iterator[str]:
         spent = [
             each["cpu_seconds"] for each in facts.values() if "cpu_seconds" in each
         ]
-        failed = sum(each.get("status") != "complete" for each in facts.values())
+        failed = sum(each.get("status") != COMPLETE for each in facts.values())
         total += sum(spent)
         peak = max(peak, *(each.get("peak_memory_mib", 0.0) for each in facts.values()))
         mean = f"{sum(spent) / max(1, len(spent)):.2f}"
@@ -131,12 +138,9 @@ def closing_lines(plans: Sequence[Plan], seconds: float) -> Iterator[str]:
 def _ever_requested(directory: Path) -> list[int]:
     """The seeds that were ever requested of a variant, by the JSON of begun ones."""
     seeds: set[int] = set()
-    for number in files.seeds_of(directory, "json"):
-        try:
-            for first, last in records.read_facts(directory, number)["asked"]:
-                seeds.update(range(first, min(last, first + _MOST) + 1))
-        except records.MALFORMED:
-            continue
+    for number in seeds_of(directory, "json"):
+        with suppress(BcrlError):  # a damaged JSON
+            seeds |= requested(read_document(directory, number))
     return sorted(seeds)
 
 

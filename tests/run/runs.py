@@ -8,6 +8,7 @@ from pathlib import Path
 
 from bcrl.common import files
 from bcrl.config.plan import Plan
+from bcrl.results.layout import seed_path
 from bcrl.run import runner
 from tests.conftest import plan
 
@@ -35,18 +36,18 @@ def run(folder: Path, *overrides: str) -> Plan:
 
 def results(made: Plan, seed: int) -> tuple[bytes, bytes]:
     """A seed's CSV and NPZ."""
-    csv, npz = (files.seed_path(made.directory, seed, s) for s in ("csv", "npz"))
+    csv, npz = (seed_path(made.directory, seed, s) for s in ("csv", "npz"))
     return csv.read_bytes(), npz.read_bytes()
 
 
 def about(made: Plan, seed: int) -> dict:
     """A seed's JSON."""
-    return json.loads(files.seed_path(made.directory, seed, "json").read_text())
+    return json.loads(seed_path(made.directory, seed, "json").read_text())
 
 
 def rows(made: Plan, seed: int) -> list[dict[str, float]]:
     """A seed's CSV; an empty cell is NaN."""
-    lines = csv.DictReader(files.seed_path(made.directory, seed, "csv").open())
+    lines = csv.DictReader(seed_path(made.directory, seed, "csv").open())
     return [{key: float(cell or "nan") for key, cell in x.items()} for x in lines]
 
 

@@ -12,16 +12,16 @@ import pandas as pd
 import pytest
 
 from bcrl import api
-from bcrl.common import files
 from bcrl.config.plan import part
 from bcrl.errors import BcrlError
+from bcrl.results.layout import seed_path, seeds_of
 from bcrl.run import costs, progress, records, runner, status
 from bcrl.run.origin import run_origin
 from bcrl.run.progress import Progress, Tick
 from bcrl.run.schedule import merged, ordered
 from bcrl.run.workers import Died, cores, do_jobs
 from tests.conftest import arguments, plan, plans
-from tests.made_up import made_up_plan, write_seeds
+from tests.results.made_up import made_up_plan, write_seeds
 from tests.run.light import work
 from tests.run.runs import FQI, MAZE, results, run
 
@@ -196,7 +196,7 @@ def replaced(old: str, new: str):
 def test_a_changed_result_is_not_complete_and_is_named(tmp_path, suffix, damage):
     p = made(tmp_path, range(3))
     assert records.pending(p) == [] and records.damaged(p.directory, p.seeds) == {}
-    damage(files.seed_path(p.directory, 1, suffix))
+    damage(seed_path(p.directory, 1, suffix))
     assert records.pending(p) == [1]
     (why,) = records.damaged(p.directory, p.seeds).values()
     assert suffix.upper() in why
@@ -209,25 +209,25 @@ def test_a_seed_of_another_variant_is_not_complete(tmp_path):
     other = made_up_plan(tmp_path, "hill", "C-FQI", range(1))
     p.directory.rename(other.directory)
     assert records.pending(other) == [0]
-    assert "another run's" in records.damaged(other.directory, [0])[0]
+    assert "belongs to variant" in records.damaged(other.directory, [0])[0]
 
 
 def test_a_rerun_makes_a_changed_seed_again_and_reports_it(tmp_path, capsys):
     words = ("env=maze", *FQI, "algorithm/regressor=tabular")
     p = run(tmp_path, *words)
-    first, second = (files.seed_path(p.directory, seed, "csv") for seed in (0, 1))
+    first, second = (seed_path(p.directory, seed, "csv") for seed in (0, 1))
     before, when = second.read_bytes(), first.stat().st_mtime_ns
     second.write_bytes(before.replace(b"1", b"2", 1))
     runner.run(p)
     assert second.read_bytes() == before and first.stat().st_mtime_ns == when
-    assert "seed 1: the CSV was changed" in capsys.readouterr().err
+    assert "seed 1: the CSV is not" in capsys.readouterr().err
     assert records.pending(p) == []
 
 
 def test_seeds_are_in_the_order_of_their_numbers(tmp_path):
     p = made(tmp_path, range(9998, 10002))
     (p.directory / "seed_mine.csv").write_text("a\n1\n")
-    assert files.seeds_of(p.directory, "csv") == [9998, 9999, 10000, 10001]
+    assert seeds_of(p.directory, "csv") == [9998, 9999, 10000, 10001]
     frame = api.read(p.directory)
     assert list(dict.fromkeys(frame["seed"])) == [9998, 9999, 10000, 10001]
 

@@ -18,7 +18,7 @@ from bcrl import api
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.learning.fqi import FQI as Learner
 from bcrl.learning.stage import SeedBatch, learn
-from bcrl.report.seedfiles import read_csv
+from bcrl.results.read import read_csv
 from bcrl.run import runner
 from bcrl.run.records import is_complete, pending
 from tests.conftest import plan

@@ -15,10 +15,11 @@ import pandas as pd
 import pytest
 from PIL import Image, ImageColor
 
-from bcrl.report import cli, style
-from bcrl.report.seedfiles import METRICS
-from tests.test_page import write_own
-from tests.test_report import write_runs
+from bcrl.report import cli
+from bcrl.report.figures import style
+from bcrl.results.layout import FQI_METRICS
+from tests.report.test_page import write_own
+from tests.report.test_report import write_runs
 
 NEEDED = "BCRL_BROWSER"  # set where a missing browser is an error, as in CI
 SWITCHES = (
@@ -26,6 +27,7 @@ SWITCHES = (
     *("disable-background-networking", "disable-component-update", "disable-sync"),
 )
 WIDTH, HEIGHT = 1280, 900
+pytestmark = pytest.mark.browser
 
 
 def start_browser(profile: Path):
@@ -120,7 +122,7 @@ class Page:
 @pytest.fixture(scope="module")
 def runs_dir(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("runs")
-    for env in METRICS:
+    for env in FQI_METRICS:
         write_runs(root, env)
     write_own(root)
     assert cli.main(["--runs-dir", str(root), "--scale", "smoke"]) == 0
@@ -165,10 +167,8 @@ def test_the_page_is_drawn(page):
     panel = page.shot("#runs-1 [data-metric=q_error]")
     for method in ("FQI", "C-FQI", "B-FQI", "BC-FQI"):
         assert inked(panel, method) > 100
-    loaded = (
-        "return [...document.images].every((i) => i.complete && i.naturalWidth > 99)"
-    )
-    assert page.script(loaded)
+    loaded = "(i) => i.complete && i.naturalWidth > 99"
+    assert page.script(f"return [...document.images].every({loaded})")
 
 
 def test_a_method_can_be_hidden(page):
@@ -176,9 +176,8 @@ def test_a_method_can_be_hidden(page):
     assert (button.text, button.get_attribute("aria-pressed")) == ("C-FQI", "true")
     button.click()
     assert button.get_attribute("aria-pressed") == "false"
-    assert (
-        page.driver.find_elements("css selector", f"{RETURN} [data-method=C-FQI]") == []
-    )
+    hidden = page.driver.find_elements("css selector", f"{RETURN} [data-method=C-FQI]")
+    assert hidden == []
     assert inked(page.shot(RETURN), "C-FQI") == 0 < inked(page.shot(RETURN), "BC-FQI")
     page.focus("#runs-1 .method:nth-of-type(2)")
     page.keys(" ")  # the keyboard shows it again
@@ -226,29 +225,29 @@ def test_arrow_keys_walk_through_the_values(page, runs_dir):
     assert values(page, panel) == pytest.approx(means, rel=1e-4) and len(means) == 2
 
 
-def test_seeds_median_and_zoom(page):
-    def button(text: str):
-        (found,) = (
-            b
-            for b in page.driver.find_elements("css selector", "#runs-1 button")
-            if b.text == text
-        )
-        return found
+def press(page: Page, text: str) -> None:
+    buttons = page.driver.find_elements("css selector", "#runs-1 button")
+    (found,) = (button for button in buttons if button.text == text)
+    found.click()
 
-    before = page.find(f"{RETURN} [data-method=BC-FQI] .centre").get_attribute("d")
-    button("median").click()
-    after = page.find(f"{RETURN} [data-method=BC-FQI] .centre").get_attribute("d")
-    assert before != after
-    button("single seeds").click()
-    seeds = f"{RETURN} [data-method=BC-FQI] .seed"
+
+def tasks_on_axis(page: Page) -> list[str]:
+    return [text for text in page.texts(f"{RETURN} text") if text.startswith("T")]
+
+
+def test_seeds_median_and_zoom(page):
+    centre = f"{RETURN} [data-method=C-FQI] .centre"
+    before = page.find(centre).get_attribute("d")
+    press(page, "median")
+    assert page.find(centre).get_attribute("d") != before
+    press(page, "single seeds")
+    seeds = f"{RETURN} [data-method=C-FQI] .seed"
     assert len(page.driver.find_elements("css selector", seeds)) == 6
     page.focus(f"{RETURN} svg")
     page.keys("+")
-    axis = [text for text in page.texts(f"{RETURN} text") if text.startswith("T")]
-    assert "T5" in axis and "T1" not in axis
+    assert "T5" in tasks_on_axis(page) and "T1" not in tasks_on_axis(page)
     page.keys("\ue00c")  # Escape
-    axis = [text for text in page.texts(f"{RETURN} text") if text.startswith("T")]
-    assert "T1" in axis
+    assert "T1" in tasks_on_axis(page)
 
 
 def test_it_fits_a_telephone(page):
@@ -259,9 +258,8 @@ def test_it_fits_a_telephone(page):
 
 def test_names_from_files_stay_text(page):
     assert "My <i>env, FQI" in page.texts("h2")
-    assert (
-        page.script("return document.querySelectorAll('h2 i, main script').length") == 0
-    )
+    found = "document.querySelectorAll('h2 i, main script')"
+    assert page.script(f"return {found}.length") == 0
 
 
 def test_it_can_be_read_without_scripts(page):
@@ -278,21 +276,17 @@ def test_it_can_be_read_without_scripts(page):
 def test_the_policy_forbids_requests(page):
     """What the other tests watch for would be seen, and would not get out."""
     url = "http://[::1]/x"
-    page.script(
-        "document.body.append(Object.assign(new Image(), {src: arguments[0]}))", url
-    )
+    image = "document.body.append(Object.assign(new Image(), {src: arguments[0]}))"
+    page.script(image, url)
     failed = "fetch(arguments[0]).catch(() => arguments[1]())"
     page.driver.execute_async_script(failed, url)
-    said = [entry["message"] for entry in page.driver.get_log("browser")]
-    assert any("img-src" in text for text in said)
-    assert any("default-src" in text for text in said)
+    messages = [entry["message"] for entry in page.driver.get_log("browser")]
+    assert any("img-src" in text for text in messages)
+    assert any("default-src" in text for text in messages)
     events = page.events()
-    asked = [
-        e["requestId"]
-        for e in events["Network.requestWillBeSent"]
-        if e["request"]["url"] == url
-    ]
-    failed = {
+    sent = events["Network.requestWillBeSent"]
+    reasons = {
         e["requestId"]: e.get("blockedReason") for e in events["Network.loadingFailed"]
     }
-    assert asked and all(failed[each] == "csp" for each in asked)
+    sent = [e["requestId"] for e in sent if e["request"]["url"] == url]
+    assert sent and all(reasons[each] == "csp" for each in sent)

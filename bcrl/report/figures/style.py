@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import itertools
+import textwrap
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from bcrl import __version__
 from bcrl.common.files import write_atomically
-from bcrl.report.variants import Variant
+from bcrl.report.notes import remarks, tags_shown
+from bcrl.report.variants import Methods, Runs, Variant, env_title
 
 #: One colour per way of transfer, in every figure and for FQI and DQN alike: Okabe and
 #: Ito's palette and a grey. Yellow is left out, it vanishes on white.
@@ -38,6 +42,7 @@ OPTIMUM = {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 1.0}
 DPI = 150
 WIDTH = 7.2  # inches, a full text width
 NARROW = 0.055  # share of an axis below which neighbouring labels take two rows
+FOOTER_WIDTH = 20  # characters of small print per inch
 
 RC = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine
@@ -57,6 +62,8 @@ RC = {
     "pdf.fonttype": 42,  # TrueType: text stays text
 }
 
+Span = tuple[str, float, float]  # a task's name, where it begins and ends
+
 
 def sheet() -> AbstractContextManager[None]:
     """The style, to be in force while a figure is drawn and while it is saved."""
@@ -72,28 +79,20 @@ def colour(method: str) -> str:
     return COLOURS.get(prefix, COLOURS["PPR"]) if dash else COLOURS[""]
 
 
-Span = tuple[str, float, float]  # a task's name, where it begins and ends
-
-
 def dashed(method: str) -> bool:
     """Whether it is another algorithm than the families': its lines are dashed."""
     return method not in COLOURS and method.rpartition("-")[2] not in ("FQI", "DQN")
 
 
-def stage_spans(variants: Iterable[Variant]) -> list[Span]:
-    """Name and extent, on the iteration axis, of every task of the longest variant.
-
-    Of equally long ones it is the one with most tasks, hence one with a curriculum.
-    """
-    return task_spans(
-        max(variants, key=lambda v: (len(v.stage), len(np.unique(v.task))))
-    )
+def line_of(method: str) -> dict[str, Any]:
+    """Colour and dashes of a method's line, for matplotlib."""
+    return {"color": colour(method), "linestyle": "--" if dashed(method) else "-"}
 
 
 def task_spans(variant: Variant) -> list[Span]:
     """Name and extent, on the axis of iterations or steps, of every task of a variant.
 
-    An iteration reaches half a one to either side; steps go on from task to task.
+    An iteration reaches half a one to either side; steps continue across tasks.
     """
     starts = [0, *(np.flatnonzero(np.diff(variant.task)) + 1), len(variant.task)]
     edges = np.arange(len(variant.task) + 1) + 0.5
@@ -116,35 +115,14 @@ def shade_tasks(axes: Axes, spans: Sequence[Span]) -> None:
         narrow = (end - start) / (last - first) < NARROW
         row = 1 - row if narrow and previous_narrow else 0
         previous_narrow = narrow
-        axes.annotate(
-            label,
-            ((start + end) / 2, 1.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(0, 2 + 8 * row),
-            textcoords="offset points",
-            ha="center",
-            va="bottom",
-            fontsize=7,
-            color="0.35",
-        )
-
-
-def band(
-    axes: Axes,
-    x: NDArray[np.int64],
-    centre: NDArray[np.float64],
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-    method: str,
-) -> None:
-    """A mean line with a band around it."""
-    axes.fill_between(x, low, high, color=colour(method), alpha=0.25, linewidth=0)
-    line = "--" if dashed(method) else "-"
-    axes.plot(x, centre, color=colour(method), linewidth=1.6, linestyle=line)
+        small = {"ha": "center", "va": "bottom", "fontsize": 7, "color": "0.35"}
+        above = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+        middle, shift = ((start + end) / 2, 1.0), (0, 2 + 8 * row)
+        axes.annotate(label, middle, shift, **above, **small)
 
 
 def cut(axes: Axes, names: Sequence[str], within: Sequence[NDArray]) -> None:
-    """Let the y-axis show what is `within`, and say whose curves leave it.
+    """Let the y-axis show what is `within`, and name the curves that leave it.
 
     For curves `names` that diverge: they would flatten all others.
     """
@@ -162,45 +140,54 @@ def cut(axes: Axes, names: Sequence[str], within: Sequence[NDArray]) -> None:
 
 def legend(figure: Figure, methods: Iterable[str], optimum: bool = False) -> None:
     """One legend for the whole figure, above it."""
-    handles = [
-        Line2D(
-            *([], []),
-            color=colour(method),
-            linestyle="--" if dashed(method) else "-",
-            linewidth=2,
-            label=method,
-        )
-        for method in methods
-    ]
+    lines = [{"label": name, "linewidth": 2, **line_of(name)} for name in methods]
     if optimum:
-        handles.append(Line2D([], [], label="optimum of the target", **OPTIMUM))
+        lines.append({"label": "optimum of the target", **OPTIMUM})
     figure.legend(
-        handles=handles,
+        handles=[Line2D([], [], **line) for line in lines],
         loc="outside upper center",
-        ncols=len(handles),
+        ncols=len(lines),
         handlelength=1.8,
     )
 
 
-def footer(figure: Figure | SubFigure, lines: Iterable[str]) -> None:
-    """Small print under the figure: what is drawn, from how many seeds, what is odd."""
-    text = "\n".join(lines)
+def footer(
+    figure: Figure, runs: Runs, methods: Methods, what: str, compares: bool = True
+) -> None:
+    """Small print: environment, scale, number of seeds, `what` is drawn, what is odd.
+
+    `compares`: differences between methods belong to it.
+    """
+    env = next(v.env for v in methods.values())
+    counts = {name: len(v.seeds) for name, v in methods.items()}
+    if len(set(counts.values())) == 1:
+        n = next(iter(counts.values()))
+        seeds = f"{n} seed{'s' * (n != 1)}{' per method' * (len(counts) > 1)}"
+    else:
+        seeds = "seeds " + ", ".join(f"{name} {n}" for name, n in counts.items())
+    parts = [env_title(env), f"scale {runs.scale}", seeds, tags_shown(methods), what]
+    lines = [" · ".join(filter(None, parts))]
+    lines += remarks(runs.notes, methods, compares)
+    limit = int(figure.get_figwidth() * FOOTER_WIDTH)
+    text = "\n".join(part for line in lines for part in textwrap.wrap(line, limit))
     figure.supxlabel(text, x=0.01, ha="left", fontsize=6.5, color="0.35")
+
+
+def colour_bar(axes: Axes, image: Any, shrink: float, aspect: float) -> Any:
+    """A thin colour bar beside an image."""
+    bar = axes.figure.colorbar(image, ax=axes, shrink=shrink, aspect=aspect, pad=0.03)
+    bar.outline.set_linewidth(0.5)
+    bar.ax.tick_params(labelsize=6.5, width=0.5, length=2)
+    return bar
 
 
 def save(figure: Figure, folder: Path, name: str, title: str) -> list[Path]:
     """Write `name`.png and `name`.pdf, atomically and without a date inside."""
     software = f"bcrl {__version__}"
-    metadata = {
-        "png": {"Title": title, "Software": software},
-        "pdf": {"Title": title, "Creator": software, "CreationDate": None},
-    }
-    return [
-        write_atomically(
-            folder / f"{name}.{kind}",
-            lambda handle, kind=kind: figure.savefig(
-                handle, format=kind, dpi=DPI, metadata=metadata[kind]
-            ),
-        )
-        for kind in metadata
-    ]
+    pdf = {"Title": title, "Creator": software, "CreationDate": None}
+    files = []
+    for kind, about in (("png", {"Title": title, "Software": software}), ("pdf", pdf)):
+        options = {"format": kind, "dpi": DPI, "metadata": about}
+        write = partial(figure.savefig, **options)
+        files.append(write_atomically(folder / f"{name}.{kind}", write))
+    return files

@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.report.load import COMPARED
-from bcrl.report.variants import Runs, Variant
+from bcrl.report.variants import Methods, Variant
 
 LINEAR = "linear_system"
 WINDOW = 5000  # environment steps before a run's end whose evaluations are averaged
 
 #: A learner's name in the records → in the figures.
 LEARNERS = {"lspi": "LSPI", "dqn": "DQN on LQ"}
-
-
-def linear_methods(runs: Runs, tag: str | None) -> dict[str, Variant]:
-    """The linear system's DQN family; methods without the tag fall back to untagged."""
-    return runs.methods(LINEAR, tag, "DQN", fall_back=True)
-
-
-def figure_methods(runs: Runs, tag: str | None) -> dict[str, Variant]:
-    """Those of them that Figure 4 compares."""
-    compared = COMPARED[LINEAR, "DQN"]
-    found = linear_methods(runs, tag)
-    return {name: v for name, v in found.items() if name in compared}
 
 
 def target_rows(variant: Variant) -> NDArray[np.intp]:
@@ -45,11 +30,6 @@ def late(variant: Variant, metric: str) -> NDArray[np.float64]:
     return variant.metrics[metric][:, late_rows(variant)].mean(axis=1)
 
 
-def last(variant: Variant, metric: str) -> NDArray[np.float64]:
-    """A metric at the last evaluation, (S,)."""
-    return variant.metrics[metric][:, -1]
-
-
 def area(variant: Variant, metric: str) -> NDArray[np.float64]:
     """Every seed's mean over all evaluations in the target, (S,)."""
     return variant.metrics[metric][:, target_rows(variant)].mean(axis=1)
@@ -57,42 +37,33 @@ def area(variant: Variant, metric: str) -> NDArray[np.float64]:
 
 def pretraining_rows(variant: Variant) -> NDArray[np.intp]:
     """Rows of a first stage on another task than the target; may be none, (P,)."""
-    other = variant.task != variant.task[-1]
-    return np.flatnonzero((variant.stage == 1) & other)
+    return np.flatnonzero((variant.stage == 1) & (variant.task != variant.task[-1]))
 
 
 def first_learner(variant: Variant) -> str:
     """`lspi` or `dqn`, whichever trains the first stage (recorded in the JSON)."""
-    learners = variant.sidecars[0].get("learners")
-    if learners:
-        return str(learners[0])
-    return "dqn" if variant.method in ("DQN", "C-DQN") else "lspi"
+    return str(variant.sidecars[0]["learners"][0])
 
 
-def pretraining(methods: Mapping[str, Variant]) -> dict[str, Variant]:
+def pretraining(methods: Methods) -> dict[str, Variant]:
     """A variant that shows each learner's pretraining: the one with most seeds.
 
     Methods that pretrain with the same learner share that stage, draw by draw.
     """
     found: dict[str, Variant] = {}
-    for learner in LEARNERS:
-        ours = [
-            v
-            for v in methods.values()
-            if len(pretraining_rows(v)) and first_learner(v) == learner
-        ]
-        if ours:
-            found[learner] = max(ours, key=lambda v: len(v.seeds))
-    return found
+    for variant in sorted(methods.values(), key=lambda v: -len(v.seeds)):
+        if len(pretraining_rows(variant)):
+            found.setdefault(first_learner(variant), variant)
+    return {learner: found[learner] for learner in LEARNERS if learner in found}
 
 
-def switches(methods: Mapping[str, Variant]) -> dict[tuple[str, int], str]:
+def switches(methods: Methods) -> dict[tuple[str, int], str]:
     """Where pretraining ends: (learner, environment steps) → its label."""
     found = {}
     for variant in methods.values():
         rows = pretraining_rows(variant)
         if len(rows):
-            step = int(variant.index[rows[-1]])
             learner = first_learner(variant)
-            found[learner, step] = f"{LEARNERS.get(learner, learner)} → target"
+            label = f"{LEARNERS.get(learner, learner)} → target"
+            found[learner, int(variant.index[rows[-1]])] = label
     return found

@@ -18,20 +18,21 @@ import yaml
 
 from bcrl.common.identity import identity
 from bcrl.errors import BcrlError
-from bcrl.report import verify
 from bcrl.report.load import load_runs
-from bcrl.report.seedfiles import DQN_METRICS, METRICS
-from tests.made_up import made_up_plan, write_seeds
+from bcrl.results import verify
+from bcrl.results.layout import DQN_METRICS, FQI_METRICS, seed_path
+from tests.results.made_up import made_up_plan, write_seeds
 
 VARIANTS = {
-    "maze/BC-FQI": METRICS["maze"],
-    "maze/C-FQI@tag": METRICS["maze"],
+    "maze/BC-FQI": FQI_METRICS["maze"],
+    "maze/C-FQI@tag": FQI_METRICS["maze"],
     "linear_system/DQN": DQN_METRICS,
 }
 SEEDS = 2
 TRIES = 36  # of each kind
 SUFFIXES = ("csv", "npz", "json")
 NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:e-?\d+)?")
+Rng = np.random.Generator
 
 
 def grow(root: Path) -> None:
@@ -53,113 +54,58 @@ def grow(root: Path) -> None:
         write_seeds(plan, table, arrays, {"optimum": -47.5, "cpu_seconds": 1.25})
 
 
-# --- what can happen to files: functions of a generator and the tree's root
-
-Mutation = Callable[[np.random.Generator, Path], None]
+# --- what can happen: to bytes, to the lines or a number of a text, to files
 
 
-def any_file(rng: np.random.Generator, root: Path, *suffixes: str) -> Path:
+def replaced(data: bytes, at: int, new: bytes, old: int = 1) -> bytes:
+    return data[:at] + new + data[at + old :]
+
+
+BYTES: dict[str, Callable[[Rng, bytes, int], bytes]] = {
+    "flip_bit": lambda r, d, at: replaced(d, at, bytes([d[at] ^ 1 << r.integers(8)])),
+    "other_byte": lambda r, d, at: replaced(d, at, r.bytes(1)),
+    "cut": lambda r, d, at: d[:at],
+    "insert": lambda r, d, at: replaced(d, at, r.bytes(r.integers(1, 9)), 0),
+    "drop_bytes": lambda r, d, at: replaced(d, at, b"", int(r.integers(1, 9))),
+    "empty": lambda r, d, at: b"",
+}
+LINES: dict[str, Callable[[list[bytes], int, int], list[bytes]]] = {
+    "delete_line": lambda x, i, j: x[:i] + x[i + 1 :],
+    "swap_lines": lambda x, i, j: [x[{i: j, j: i}.get(n, n)] for n in range(len(x))],
+    "duplicate_line": lambda x, i, j: [*x[:i], x[j], *x[i:]],
+    "append_line": lambda x, i, j: [*x, x[i]],
+}
+NUMBERS: dict[str, Callable[[Rng, bytes], bytes]] = {
+    "change_number": lambda r, x: b"%r" % (float(x or 0) + r.choice([1, -1, 10])),
+    "change_last_digit": lambda r, x: x[:-1] + b"%d" % ((int(x[-1:] or 0) + 1) % 10),
+    "not_a_number": lambda r, x: r.choice([b"nan", b"NaN", b"inf", b".nan", b"null"]),
+}
+
+
+def any_file(rng: Rng, root: Path, *suffixes: str) -> Path:
     files = sorted(p for p in root.rglob("*") if p.is_file())
     return rng.choice([p for p in files if not suffixes or p.suffix[1:] in suffixes])
 
 
-def any_text(rng: np.random.Generator, root: Path) -> Path:
-    return any_file(rng, root, "csv", "json", "yaml")
-
-
-def any_folder(rng: np.random.Generator, root: Path) -> Path:
+def any_folder(rng: Rng, root: Path) -> Path:
     return root / "smoke" / rng.choice(list(VARIANTS))
 
 
-def flip_bit(rng, root):
-    path = any_file(rng, root)
-    data = bytearray(path.read_bytes())
-    data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
-    path.write_bytes(data)
-
-
-def other_byte(rng, root):
-    path = any_file(rng, root)
-    data = bytearray(path.read_bytes())
-    data[rng.integers(len(data))] = rng.integers(256)
-    path.write_bytes(data)
-
-
-def cut(rng, root):
-    path = any_file(rng, root)
+def edit(kind: str, rng: Rng, root: Path) -> None:
+    """Apply one of the edits above to a file."""
+    path = any_file(rng, root, *(() if kind in BYTES else ("csv", "json", "yaml")))
     data = path.read_bytes()
-    path.write_bytes(data[: rng.integers(len(data))])
-
-
-def insert(rng, root):
-    path = any_file(rng, root)
-    data, at = path.read_bytes(), int(rng.integers(path.stat().st_size))
-    path.write_bytes(data[:at] + rng.bytes(rng.integers(1, 9)) + data[at:])
-
-
-def drop_bytes(rng, root):
-    path = any_file(rng, root)
-    data, at = path.read_bytes(), int(rng.integers(path.stat().st_size))
-    path.write_bytes(data[:at] + data[at + int(rng.integers(1, 9)) :])
-
-
-def empty(rng, root):
-    any_file(rng, root).write_bytes(b"")
-
-
-def delete(rng, root):
-    any_file(rng, root).unlink()
-
-
-def edit_lines(rng, root, edit: Callable[[list[bytes], int, int], None]) -> None:
-    path = any_text(rng, root)
-    lines = path.read_bytes().splitlines(keepends=True)
-    edit(lines, *map(int, rng.choice(len(lines), 2, replace=False)))
-    path.write_bytes(b"".join(lines))
-
-
-def delete_line(rng, root):
-    edit_lines(rng, root, lambda lines, i, _: lines.pop(i))
-
-
-def swap_lines(rng, root):
-    def swap(lines, i, j):
-        lines[i], lines[j] = lines[j], lines[i]
-
-    edit_lines(rng, root, swap)
-
-
-def duplicate_line(rng, root):
-    edit_lines(rng, root, lambda lines, i, j: lines.insert(i, lines[j]))
-
-
-def append_line(rng, root):
-    edit_lines(rng, root, lambda lines, i, _: lines.append(lines[i]))
-
-
-def edit_number(rng, root, new: Callable[[bytes], bytes]) -> None:
-    path = any_text(rng, root)
-    data = path.read_bytes()
-    found = rng.choice([m.span() for m in NUMBER.finditer(data)] or [(0, 0)])
-    before, after = data[: found[0]], data[found[1] :]
-    path.write_bytes(before + new(data[found[0] : found[1]]) + after)
-
-
-def change_number(rng, root):
-    amount = int(rng.choice([1, -1, 10]))
-    edit_number(rng, root, lambda old: b"%r" % (float(old or 0) + amount))
-
-
-def change_last_digit(rng, root):
-    def next_digit(old: bytes) -> bytes:
-        return old[:-1] + b"%d" % ((int(old[-1:] or 0) + 1) % 10)
-
-    edit_number(rng, root, next_digit)
-
-
-def not_a_number(rng, root):
-    word = [b"nan", b"NaN", b"inf", b".nan", b"null"][rng.integers(5)]
-    edit_number(rng, root, lambda old: word)
+    if kind in BYTES:
+        changed = BYTES[kind](rng, data, int(rng.integers(len(data))))
+    elif kind in LINES:
+        lines = data.splitlines(keepends=True)
+        places = map(int, rng.choice(len(lines), 2, replace=False))
+        changed = b"".join(LINES[kind](lines, *places))
+    else:
+        found = rng.choice([m.span() for m in NUMBER.finditer(data)] or [(0, 0)])
+        new = NUMBERS[kind](rng, data[found[0] : found[1]])
+        changed = data[: found[0]] + new + data[found[1] :]
+    path.write_bytes(changed)
 
 
 def swap_files(one: Path, other: Path) -> None:
@@ -168,59 +114,46 @@ def swap_files(one: Path, other: Path) -> None:
     other.write_bytes(one_data)
 
 
-def swap_seeds(rng, root):
-    """One file of two seeds, or all three."""
-    folder = any_folder(rng, root)
-    i, j = rng.choice(SEEDS, 2, replace=False)
-    wanted = SUFFIXES if rng.random() < 0.3 else [rng.choice(SUFFIXES)]
-    for suffix in wanted:
-        swap_files(*(folder / f"seed_{seed:04d}.{suffix}" for seed in (i, j)))
-
-
-def swap_variants(rng, root):
-    """A seed's file, all three, or config.yaml of two variants."""
-    one, other = (root / "smoke" / n for n in rng.choice(list(VARIANTS), 2, False))
+def swap(rng: Rng, root: Path) -> None:
+    """A seed's file, all three, or config.yaml, of any two seeds and variants."""
+    one, other = any_folder(rng, root), any_folder(rng, root)
     i, j = rng.integers(SEEDS, size=2)
     suffix = rng.choice([*SUFFIXES, "all", "config"])
     if suffix == "config":
         swap_files(one / "config.yaml", other / "config.yaml")
         return
     for each in SUFFIXES if suffix == "all" else [suffix]:
-        swap_files(one / f"seed_{i:04d}.{each}", other / f"seed_{j:04d}.{each}")
+        swap_files(seed_path(one, i, each), seed_path(other, j, each))
 
 
-def duplicate_seed(rng, root):
+def duplicate_seed(rng: Rng, root: Path) -> None:
     """A seed once more, under the number of another or of none."""
-    folder = any_folder(rng, root)
-    i, j = rng.choice(2 * SEEDS, 2, replace=False)
-    i %= SEEDS
-    if i == j:
-        j += SEEDS
-    wanted = SUFFIXES if rng.random() < 0.6 else [rng.choice(SUFFIXES)]
-    for suffix in wanted:
-        source = folder / f"seed_{i:04d}.{suffix}"
-        shutil.copy(source, folder / f"seed_{j:04d}.{suffix}")
+    folder, i = any_folder(rng, root), int(rng.integers(SEEDS))
+    j = (i + rng.integers(1, SEEDS + 1)) % (SEEDS + 1)
+    for suffix in SUFFIXES if rng.random() < 0.6 else [rng.choice(SUFFIXES)]:
+        shutil.copy(seed_path(folder, i, suffix), seed_path(folder, j, suffix))
 
 
-def copy_file(rng, root):
+def delete(rng: Rng, root: Path) -> None:
+    """A file, or all of a seed."""
+    path = any_file(rng, root)
+    for each in path.parent.glob(f"{path.stem}.*") if rng.random() < 0.5 else [path]:
+        each.unlink()
+
+
+def copy_file(rng: Rng, root: Path) -> None:
     """A file beside itself, under a name such as people and programs give."""
     path = any_file(rng, root, *SUFFIXES)
     name = rng.choice(["{0} (copy){1}", "{0}{1}.bak", "{0}{1}~", "{0}_old{1}"])
     shutil.copy(path, path.with_name(name.format(path.stem, path.suffix)))
 
 
-def move_file(rng, root):
+def move_file(rng: Rng, root: Path) -> None:
     path = any_file(rng, root)
     path.rename(any_folder(rng, root) / f"moved_{path.name}")
 
 
-def delete_seed(rng, root):
-    folder, seed = any_folder(rng, root), rng.integers(SEEDS)
-    for suffix in SUFFIXES:
-        (folder / f"seed_{seed:04d}.{suffix}").unlink()
-
-
-def copy_folder(rng, root):
+def copy_folder(rng: Rng, root: Path) -> None:
     """A variant under another's name, in its place or as a new one."""
     folder = any_folder(rng, root)
     names = [*VARIANTS, "maze/FQI", "maze/BC-FQI@new", "linear_system/C-DQN"]
@@ -230,13 +163,9 @@ def copy_folder(rng, root):
     shutil.copytree(folder, target)
 
 
-KINDS: tuple[Mutation, ...] = (
-    *(flip_bit, other_byte, cut, insert, drop_bytes, empty, delete),
-    *(delete_line, swap_lines, duplicate_line, append_line),
-    *(change_number, change_last_digit, not_a_number),
-    *(swap_seeds, swap_variants, duplicate_seed, copy_file, move_file),
-    *(delete_seed, copy_folder),
-)
+FILES = (swap, duplicate_seed, delete, copy_file, move_file, copy_folder)
+KINDS = {k: lambda r, root, k=k: edit(k, r, root) for k in BYTES | LINES | NUMBERS}
+KINDS |= {kind.__name__: kind for kind in FILES}
 
 
 # --- what a file's values are
@@ -266,11 +195,8 @@ def values(name: str, data: bytes) -> str:
 
 
 def read(root: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(root)): path.read_bytes()
-        for path in root.rglob("*")
-        if path.is_file()
-    }
+    files = (path for path in root.rglob("*") if path.is_file())
+    return {str(path.relative_to(root)): path.read_bytes() for path in files}
 
 
 def changed_files(before: dict[str, bytes], after: dict[str, bytes]) -> set[str]:
@@ -281,15 +207,10 @@ def changed_files(before: dict[str, bytes], after: dict[str, bytes]) -> set[str]
 
 
 def restore(root: Path, files: dict[str, bytes]) -> None:
-    present = read(root)
-    for name in present.keys() - files.keys():
-        (root / name).unlink()
-    for name in files:
-        if present.get(name) != files[name]:
-            (root / name).write_bytes(files[name])
-    for folder in sorted((p for p in root.rglob("*") if p.is_dir()), reverse=True):
-        if not any(folder.iterdir()):
-            folder.rmdir()
+    shutil.rmtree(root / "smoke")
+    for name, data in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(data)
 
 
 def is_named(name: str, root: Path, lines: list[str]) -> bool:
@@ -301,6 +222,7 @@ def is_named(name: str, root: Path, lines: list[str]) -> bool:
     return any(line.split(": ", 1)[1].startswith(tuple(starts)) for line in lines)
 
 
+@pytest.mark.slow
 def test_every_changed_value_is_caught_by_name(tmp_path, capsys):
     grow(tmp_path)
     intact = read(tmp_path)
@@ -308,7 +230,7 @@ def test_every_changed_value_is_caught_by_name(tmp_path, capsys):
     rng = np.random.default_rng(2022)
     seen: set[str] = set()
     caught: Counter[str] = Counter()
-    for mutate in KINDS:
+    for kind, mutate in KINDS.items():
         for number in range(TRIES):
             mutate(rng, tmp_path)
             after = read(tmp_path)
@@ -319,15 +241,14 @@ def test_every_changed_value_is_caught_by_name(tmp_path, capsys):
             state = hashlib.sha256(repr(sorted(after.items())).encode()).hexdigest()
             if changed and state not in seen:
                 seen.add(state)
-                what = (mutate.__name__, number, sorted(changed), lines)
+                what = (kind, number, sorted(changed), lines)
                 assert code in (1, 2), what
                 named = {n for n in changed if is_named(n, tmp_path, lines)}
                 assert named and named >= {n for n in changed if "/seed_" in n}, what
-                caught[mutate.__name__] += 1
+                caught[kind] += 1
                 if number % 9 == 0:
                     with pytest.raises(BcrlError):
                         load_runs(tmp_path, "smoke")
             restore(tmp_path, intact)
     assert verify.main([str(tmp_path)]) == 0
-    assert caught.keys() == {mutate.__name__ for mutate in KINDS}
-    assert caught.total() >= 500
+    assert caught.keys() == KINDS.keys() and caught.total() >= 500

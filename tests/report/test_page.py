@@ -15,13 +15,17 @@ import pytest
 from PIL import Image
 
 from bcrl.report import cli
-from bcrl.report import statistics as st
 from bcrl.report.curve_data import curve_data
-from bcrl.report.learning import POINTS, curve, figure_curves, shared_spans
+from bcrl.report.figures.curves import (
+    POINTS,
+    figure_curves,
+    shared_spans,
+    spread_rows,
+)
 from bcrl.report.load import load_runs
-from bcrl.report.seedfiles import DQN_METRICS
-from tests.made_up import made_up_plan, write_seeds
-from tests.test_report import write_runs
+from bcrl.results.layout import DQN_METRICS
+from tests.report.test_report import write_runs
+from tests.results.made_up import made_up_plan, write_seeds
 
 OWN = "my_<i>env"  # folders can be called so
 
@@ -62,12 +66,6 @@ def write_own(root: Path, env: str = OWN) -> None:
         write_seeds(made, lambda s, a=stages, b=tasks: dqn_table(s, a, b))
 
 
-@pytest.fixture
-def own(tmp_path: Path) -> Path:
-    write_own(tmp_path)
-    return tmp_path
-
-
 @pytest.fixture(scope="module")
 def reported(tmp_path_factory) -> Path:
     """Runs in one's own environment with everything that bcrl-report makes of them."""
@@ -101,41 +99,26 @@ def data_of(page: str) -> list[dict]:
 # --- curves
 
 
-def test_intervals_of_curves_are_those_of_means():
-    values = np.random.default_rng(0).normal(size=(8, 5))
-    low, high = st.bootstrap_curves(values)
-    each = [st.bootstrap(column) for column in values.T]
-    np.testing.assert_allclose(low, [i.low for i in each])
-    np.testing.assert_allclose(high, [i.high for i in each])
-    values[3, 1] = np.nan
-    gaps = np.isnan(st.bootstrap_curves(values))
-    assert gaps.tolist() == [[False, True, False, False, False]] * 2
-    assert np.isnan(st.bootstrap_curves(values[:1])).all()
-
-
-def test_an_environment_of_ones_own_is_drawn(own):
-    runs = load_runs(own, "smoke")
+def test_an_environment_of_ones_own_is_drawn(reported):
+    runs = load_runs(reported, "smoke")
     assert set(runs.pairs) == {(OWN, "FQI"), (OWN, "DQN")}
     figure = figure_curves(runs, OWN, "FQI")
-    assert [axes.get_ylabel() for axes in figure.axes] == [
-        "discounted return",
-        "height",
-    ]
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert labels == ["discounted return", "height"]
     lines = {(x.get_color(), x.get_linestyle()): x for x in figure.axes[0].lines}
     assert len(lines) == 3  # one's own algorithm, too
-    table = pd.concat(
-        pd.read_csv(path) for path in own.glob("smoke/*/BC-FQI/seed_*.csv")
-    )
-    means = table.groupby("iteration")["return"].mean()
+    tables = map(pd.read_csv, reported.glob("smoke/*/BC-FQI/seed_*.csv"))
+    means = pd.concat(tables).groupby("iteration")["return"].mean()
     np.testing.assert_allclose(lines["#D55E00", "-"].get_ydata(), means)
 
 
-def test_tasks_are_shaded_where_the_courses_agree(own):
-    methods = load_runs(own, "smoke").tagged(OWN, "DQN", None)
+def test_tasks_are_shaded_where_the_curricula_agree(tmp_path):
+    write_own(tmp_path)
+    methods = load_runs(tmp_path, "smoke").tagged(OWN, "DQN", None)
     assert shared_spans(methods) == [("T1", 0.0, 2000.0), ("T2", 2000.0, 5000.0)]
-    plan = made_up_plan(own, OWN, "BC-DQN", range(3))
+    plan = made_up_plan(tmp_path, OWN, "BC-DQN", range(3))
     write_seeds(plan, lambda s: dqn_table(s, [1000, 4000], [1, 2]))
-    methods = load_runs(own, "smoke").tagged(OWN, "DQN", None)
+    methods = load_runs(tmp_path, "smoke").tagged(OWN, "DQN", None)
     assert shared_spans(methods) == []
 
 
@@ -143,11 +126,10 @@ def test_long_curves_keep_their_stages_ends(tmp_path):
     plan = made_up_plan(tmp_path, "cart", "C-DQN", range(2))
     write_seeds(plan, lambda s: dqn_table(s, [700_000, 1_300_000], [1, 2]))
     (variant,) = load_runs(tmp_path, "smoke").variants
-    found = curve(variant, "return")
-    assert POINTS <= len(found.x) <= POINTS + 2
-    assert found.x[0] == 0 and found.x[-1] == 2_000_000
-    assert (found.x == 700_000).sum() == 2
-    np.testing.assert_array_equal(found.mean, found.values.mean(axis=0))
+    x = variant.index[spread_rows(variant)]
+    assert POINTS <= len(x) <= POINTS + 2
+    assert x[0] == 0 and x[-1] == 2_000_000
+    assert (x == 700_000).sum() == 2
 
 
 def test_the_pages_curves_are_the_aggregates(reported):
@@ -202,35 +184,25 @@ def test_names_are_escaped(reported):
     assert "<h2>My &lt;i&gt;env, FQI</h2>" in page
 
 
-def test_claims_configs_costs_and_origins_are_shown(tmp_path):
+def test_the_page_has_all_parts(tmp_path):
+    """Claims, configurations, costs, origins, what differs and what is incomplete."""
     write_runs(tmp_path, "maze", seeds=6)
-    page = html.unescape(written(tmp_path, "--figures", "2", "5"))
-    assert "BC-FQI ends with a smaller error than FQI" in page
-    assert '<span class="verdict holds">holds</span>' in page
-    assert "algorithm.episodes: 5" in page
-    assert '<td data-name="CPU time">22 s</td>' in page  # 6 × 3.6 s
-    assert re.search(r"maze BC-FQI 0–5", page)
-    for n in "25":
-        assert f"Figure {n}. Maze" in page
-
-
-def test_what_differs_from_the_plain_variant_is_marked(tmp_path):
-    write_runs(tmp_path, "maze", seeds=2, methods=("FQI",))
     config = {"algorithm": {"name": "fqi", "episodes": 7}}
     plan = made_up_plan(tmp_path, "maze", "FQI@seven", range(2), config=config)
     table = pd.read_csv(tmp_path / "smoke/maze/FQI/seed_0000.csv")
     write_seeds(plan, lambda seed: table)
-    page = written(tmp_path, "--figures", "2")
-    assert "<mark>algorithm.episodes: 7</mark>   <i># FQI: 5</i>" in page
-    assert "Variants compared" in page
-
-
-def test_what_is_incomplete_is_said_first(tmp_path):
-    write_runs(tmp_path, "maze", seeds=6)
     for path in tmp_path.glob("smoke/maze/C-FQI/seed_0005.*"):
         path.unlink()
-    page = written(tmp_path, "--allow-incomplete", "--figures", "2")
+    page = html.unescape(written(tmp_path, "--allow-incomplete", "--figures", "2", "5"))
     assert '<p class="warning">INCOMPLETE: C-FQI 5 of 6 seeds</p>' in page
+    assert "BC-FQI ends with a smaller error than FQI" in page
+    assert '<span class="verdict holds">holds</span>' in page
+    assert "algorithm.episodes: 5" in page
+    assert "<mark>algorithm.episodes: 7</mark>   <i># FQI: 5</i>" in page
+    assert "Variants compared" in page
+    assert '<td data-name="CPU time">22 s</td>' in page  # 6 × 3.6 s
+    assert re.search(r"maze BC-FQI 0–5", page)
+    assert all(f"Figure {n}. Maze" in page for n in "25")
 
 
 def test_animations_of_the_scale_are_shown(reported):

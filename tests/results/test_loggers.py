@@ -12,12 +12,14 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from bcrl.common.signals import Interrupted
 from bcrl.errors import ConfigError
-from bcrl.report.integrity import check_tree
 from bcrl.results import loggers
+from bcrl.results.integrity import check_tree
+from bcrl.results.layout import LOGS, seed_path
 from bcrl.run import job, runner
 from tests.conftest import plan
 
 BC = ("env=maze", "variant=BC", "scale=smoke", "seeds.count=2", "progress=none")
+MAZE = "maze/BC-FQI"
 MODULE = """
 import json
 from dataclasses import dataclass
@@ -41,50 +43,50 @@ class Writer:
 """
 
 
-def logged(root: Path, seed: int, folder: str = "maze/BC-FQI") -> dict:
+def logged(root: Path, seed: int, folder: str = MAZE) -> dict:
     """Name of a metric → its (step, value) in the event files."""
-    run = root / loggers.FOLDER / "smoke" / folder / f"seed_{seed:04d}"
+    run = root / LOGS / "smoke" / folder / f"seed_{seed:04d}"
     events = EventAccumulator(str(run), {"scalars": 0}).Reload()
     names = events.Tags()["scalars"]
     return {n: [(e.step, e.value) for e in events.Scalars(n)] for n in names}
 
 
-def check(root: Path, seed: int, folder: str = "maze/BC-FQI") -> None:
+def check(root: Path, seed: int, folder: str = MAZE) -> None:
     """Assert that the event files hold a seed's finished CSV, each row once."""
-    table = pd.read_csv(root / "smoke" / folder / f"seed_{seed:04d}.csv")
+    table = pd.read_csv(seed_path(root / "smoke" / folder, seed, "csv"))
     count = "step" if "step" in table else "iteration"
     found = logged(root, seed, folder)
     for name in table.columns.drop(count):
         finite = table[np.isfinite(table[name])]
-        if not len(finite):
-            assert name not in found
-            continue
-        steps, values = zip(*found[name], strict=True)
+        steps, values = (
+            zip(*found.pop(name, ()), strict=True) if len(finite) else ((),) * 2
+        )
         assert list(steps) == finite[count].tolist()
         np.testing.assert_array_equal(values, finite[name].to_numpy(np.float32))
+    assert not found
 
 
 def run(root: Path, *overrides: str) -> None:
     runner.run(plan(*overrides, f"runs_dir={root}"))
 
 
+@pytest.mark.slow
 def test_the_same_bytes_with_and_without(tmp_path):
     """One logged by two processes, one not: equal results, and a log of each seed."""
-    run(tmp_path / "plain", *BC)
-    run(tmp_path / "logged", *BC, "logger=tensorboard", "workers=2")
+    plain, log = tmp_path / "plain", tmp_path / "logged"
+    run(plain, *BC)
+    run(log, *BC, "logger=tensorboard", "workers=2")
     for seed in (0, 1):
         for suffix in ("csv", "npz"):
-            path = f"smoke/maze/BC-FQI/seed_{seed:04d}.{suffix}"
-            first, second = (
-                (tmp_path / d / path).read_bytes() for d in ("plain", "logged")
-            )
-            assert first == second
-        check(tmp_path / "logged", seed)
-    assert not (tmp_path / "plain" / loggers.FOLDER).exists()
-    variants, findings = check_tree(tmp_path / "logged")
+            path = seed_path(Path("smoke") / MAZE, seed, suffix)
+            assert (plain / path).read_bytes() == (log / path).read_bytes()
+        check(log, seed)
+    assert not (plain / LOGS).exists()
+    variants, findings = check_tree(log)
     assert (len(variants), findings) == (1, [])
 
 
+@pytest.mark.slow
 def test_steps_are_logged_and_gaps_left_out(tmp_path):
     dqn = ("env=linear_system", "algorithm=dqn", "variant=BC", "scale=smoke")
     run(tmp_path, *dqn, "seeds.count=1", "progress=none", "logger=tensorboard")
@@ -94,8 +96,8 @@ def test_steps_are_logged_and_gaps_left_out(tmp_path):
 
 
 def test_an_interrupted_run_logs_nothing_twice(tmp_path, monkeypatch):
-    """A run that stops after a while resumes with a new event file."""
-    measure, train, stops, seen = job._Training.measure, job.train, [], []
+    """Stopped after a while, resumed in a new event file."""
+    measure, train, seen, stops = job._Training.measure, job.train, [], []
 
     def counted(training, snapshot):
         measure(training, snapshot)
@@ -103,52 +105,43 @@ def test_an_interrupted_run_logs_nothing_twice(tmp_path, monkeypatch):
         if len(seen) == 7:
             stops[0].ask()
 
-    def noted(some, tick, stop):
+    def stoppable(job, tick, stop):
         stops.append(stop)
-        return train(some, tick, stop)
+        return train(job, tick, stop)
 
     monkeypatch.setattr(job._Training, "measure", counted)
-    monkeypatch.setattr(job, "train", noted)
-    arguments = (*BC, "logger=tensorboard")
+    monkeypatch.setattr(job, "train", stoppable)
     with pytest.raises(Interrupted):
-        run(tmp_path, *arguments)
+        run(tmp_path, *BC, "logger=tensorboard")
     assert [step for step, _ in logged(tmp_path, 1)["return"]] == list(range(1, 8))
-    run(tmp_path, *arguments)
+    run(tmp_path, *BC, "logger=tensorboard")
     assert seen == list(range(1, 21))
-    folder = tmp_path / loggers.FOLDER / "smoke/maze/BC-FQI/seed_0001"
-    assert len(list(folder.iterdir())) == 2
+    assert len(list((tmp_path / LOGS / "smoke" / MAZE / "seed_0001").iterdir())) == 2
     for seed in (0, 1):
         check(tmp_path, seed)
 
 
-def test_a_missing_package_is_said_before_work_starts(tmp_path, monkeypatch):
-    find = loggers.importlib.util.find_spec
-    monkeypatch.setattr(
-        loggers.importlib.util,
-        "find_spec",
-        lambda name: None if name == "tensorboard" else find(name),
-    )
-    with pytest.raises(
-        ConfigError, match=r"pip install 'boosted-curriculum-rl\[tensor"
-    ):
-        run(tmp_path / "runs", *BC, "logger=tensorboard")
-    assert not (tmp_path / "runs").exists()
+def test_a_missing_package_is_named_before_work_starts(tmp_path, monkeypatch):
+    monkeypatch.setattr(loggers.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError) as rejected:
+        loggers.logger({"name": "tensorboard"})
+    assert (rejected.value.key, rejected.value.value) == ("logger", "tensorboard")
+    assert "pip install" in rejected.value.allowed
 
 
 @pytest.mark.parametrize(
-    ("override", "message"),
+    ("section", "key", "value"),
     [
-        ("logger.name=null", "must be a section with a name"),
-        ("logger.name=tensorbord", "logger.name=tensorbord: did you mean tensorboard?"),
-        ("+logger.folder=x", "logger.folder=x: unknown key"),
-        ("logger.name=os.System", "BCRL_TRUST=os"),
+        ({"name": None}, "logger", {"name": None}),
+        ({"name": "tensorbord"}, "logger.name", "tensorbord"),
+        ({"name": "none", "folder": "x"}, "logger.folder", "x"),
+        ({"name": "os.System"}, "logger.name", "os.System"),
     ],
 )
-def test_bad_input_is_refused(tmp_path, override, message):
-    with pytest.raises(ConfigError) as refused:
-        run(tmp_path / "runs", *BC, override)
-    assert message in str(refused.value)
-    assert not (tmp_path / "runs").exists()
+def test_bad_input_is_rejected(section, key, value):
+    with pytest.raises(ConfigError) as rejected:
+        loggers.logger(section)
+    assert (rejected.value.key, rejected.value.value) == (key, value)
 
 
 def test_a_logger_of_ones_own(tmp_path, monkeypatch):
@@ -160,9 +153,8 @@ def test_a_logger_of_ones_own(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("BCRL_TRUST", "my_loggers")
     monkeypatch.delitem(sys.modules, "my_loggers", raising=False)
-    overrides = (*BC, "logger=lines", f"hydra.searchpath=[{tmp_path}/conf]")
-    run(tmp_path / "runs", *overrides)
+    run(tmp_path, *BC, "logger=lines", f"hydra.searchpath=[{tmp_path}/conf]")
     lines = pd.read_json(tmp_path / "out-smoke-maze-BC-FQI-seed_0001", lines=True)
-    table = pd.read_csv(tmp_path / "runs/smoke/maze/BC-FQI/seed_0001.csv")
+    table = pd.read_csv(tmp_path / "smoke/maze/BC-FQI/seed_0001.csv")
     assert lines["count"].tolist() == table["iteration"].tolist()
     assert lines["return"].to_numpy() == pytest.approx(table["return"].to_numpy())

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bcrl.common import files
 from bcrl.config.plan import Plan
-from bcrl.report.seedfiles import METRICS
+from bcrl.results.layout import FQI_METRICS
 from bcrl.run import records
 
 
@@ -28,7 +28,7 @@ def made_up_plan(
     """A plan without anything to learn, of the variant `name` (`FQI@tag`)."""
     variant, _, tag = name.partition("@")
     whole = {
-        "env": {"name": env, "metrics": list(METRICS.get(env, ["return"]))},
+        "env": {"name": env, "metrics": list(FQI_METRICS.get(env, ["return"]))},
         "algorithm": {"name": variant.rpartition("-")[2].lower(), "episodes": 5},
         "scale": {"name": scale},
         "seeds": {"first": seeds.start, "count": len(seeds)},
