@@ -39,7 +39,7 @@ class _Worker:
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(do, theirs), daemon=True)
         resource_tracker.ensure_running()  # it would unblock what is blocked below
-        # A worker inherits the mask: signals are for the parent, which tells it.
+        # A worker inherits the mask: no signal comes before it can ignore it.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         try:
             self.process.start()
@@ -136,6 +136,9 @@ def _serve(do: Do, pipe: connection.Connection) -> None:
         with suppress(OSError):  # the parent is gone, which `_StopByPipe` shows
             pipe.send(("report", message))
 
+    for number in SIGNALS:  # for the parent; processes of a job's own get them again
+        signal.signal(number, lambda *_: None)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     with suppress(EOFError, OSError):
         while (job := pipe.recv()) is not None:
             pipe.send(("result", do(job, report, _StopByPipe(pipe))))
