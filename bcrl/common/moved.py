@@ -10,11 +10,11 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
+_LEARNING = ("bellman", "curriculum", "policies", "replay", "rollout", "stage")
 #: Old name → new name; modules below a package move with it.
-MOVED = {
+MOVED = {f"bcrl.{name}": f"bcrl.learning.{name}" for name in (*_LEARNING, "transfer")}
+MOVED |= {
     "bcrl.algorithms": "bcrl.config.algorithms",
-    "bcrl.bellman": "bcrl.learning.bellman",
-    "bcrl.curriculum": "bcrl.learning.curriculum",
     "bcrl.data": "bcrl.learning.dataset",
     "bcrl.drawing": "bcrl.envs.rendering",
     "bcrl.gym": "bcrl.envs.gym_api",
@@ -22,17 +22,12 @@ MOVED = {
     "bcrl.loggers": "bcrl.results.loggers",
     "bcrl.oracle": "bcrl.evaluation.oracle",
     "bcrl.pack": "bcrl.common.serialization",
-    "bcrl.policies": "bcrl.learning.policies",
     "bcrl.probes": "bcrl.evaluation.metrics",
     "bcrl.q.estimator": "bcrl.q.forest.estimator",
     "bcrl.q.mlp": "bcrl.q.networks.mlp",
     "bcrl.q.regression": "bcrl.q.regressors.base",
     "bcrl.q.scikit": "bcrl.q.regressors.scikit",
-    "bcrl.replay": "bcrl.learning.replay",
-    "bcrl.rollout": "bcrl.learning.rollout",
-    "bcrl.stage": "bcrl.learning.stage",
     "bcrl.streams": "bcrl.common.seeding",
-    "bcrl.transfer": "bcrl.learning.transfer",
 }
 
 

@@ -132,12 +132,12 @@ class _Packer:
         return [start, array.dtype.str, list(array.shape), order]
 
 
+@dataclasses.dataclass
 class _Unpacker:
-    def __init__(
-        self, data: NDArray[np.uint8], given: Sequence[Any], device: str
-    ) -> None:
-        self.data, self.given, self.device = data, given, device
-        self._made: list[Any] = []
+    data: NDArray[np.uint8]
+    given: Sequence[Any]
+    device: str
+    made: list[Any] = dataclasses.field(default_factory=list)
 
     def unpack(self, packed: Any) -> Any:
         if not isinstance(packed, list):
@@ -146,8 +146,9 @@ class _Unpacker:
             return packed
         kind, *rest = packed
         if kind in ("given", "same"):
-            return (self.given if kind == "given" else self._made)[rest[0]]
-        self._made.append(made := self._parts(kind, *rest))
+            return (self.given if kind == "given" else self.made)[rest[0]]
+        made = self._parts(kind, *rest)
+        self.made.append(made)
         return made
 
     def _parts(self, kind: str, what: Any, fields: dict | None = None) -> Any:
@@ -158,7 +159,11 @@ class _Unpacker:
             return {self.unpack(k): self.unpack(v) for k, v in what}
         if kind in ("array", "tensor"):
             array = self._array(*what)
-            return array if kind == "array" else _tensor(array, self.device)
+            if kind == "array":
+                return array
+            import torch  # FQI does not need it
+
+            return torch.from_numpy(array).to(self.device)
         if kind == "object" and what in _STORABLE:
             if fields is None or fields.keys() != set(_fields(_STORABLE[what])):
                 raise ValueError(f"its {what} has other fields than this version's")
@@ -172,12 +177,6 @@ class _Unpacker:
         if kind.hasobject or min(start, *shape, 0) < 0 or end > len(self.data):
             raise ValueError("its arrays lie outside of the file")
         return self.data[start:end].view(kind).reshape(shape, order=order).copy(order)
-
-
-def _tensor(array: NDArray, device: str) -> Any:
-    import torch  # FQI does not need it
-
-    return torch.from_numpy(array).to(device)
 
 
 def _text(document: Any) -> NDArray[np.uint8]:

@@ -33,11 +33,11 @@ class Stop:
     """Whether a stop was requested, by a signal or from within."""
 
     def __init__(self) -> None:
-        self.asked = False
+        self.requested = False
 
-    def ask(self) -> None:
+    def request(self) -> None:
         """Request a stop at the next pause."""
-        self.asked = True
+        self.requested = True
 
     @contextlib.contextmanager
     def on_signals(self) -> Iterator[None]:
@@ -55,14 +55,14 @@ class Stop:
             if number in came:
                 signal.signal(number, signal.SIG_DFL)
                 os.kill(os.getpid(), number)
-            if not self.asked:
+            if not self.requested:
                 name = signal.Signals(number).name
                 # Not print: the signal may have come in the middle of one.
                 text = f"bcrl: {name}: saving; once more to quit at once\n"
                 with contextlib.suppress(*GONE):
                     os.write(2, text.encode())
             came.add(number)
-            self.ask()
+            self.request()
 
         used = [n for n in SIGNALS if signal.getsignal(n) is not signal.SIG_IGN]
         before = {number: signal.signal(number, note) for number in used}

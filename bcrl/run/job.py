@@ -153,7 +153,7 @@ class _Training:
                 tick(Tick(pause.stage.task, pause.count, self.progress.wall))
             if ends and pause.count == length:
                 break
-            if stop.asked:
+            if stop.requested:
                 self.progress.interruptions += 1
                 self._save(pause.count / length)
                 return {}

@@ -73,15 +73,15 @@ class Slurm(SlurmLauncher):
                 try:
                     submitted = executor.map_array(self, *zip(*some, strict=True))
                 except (RuntimeError, OSError) as error:
-                    if stop.asked:  # Ctrl-C also ends a hanging sbatch
+                    if stop.requested:  # Ctrl-C also ends a hanging sbatch
                         break
                     raise _rejected(error, arrays, first, len(rows)) from error
                 arrays.append(submitted[0].job_id.partition("_")[0])
                 count = f"{len(some)} job{'s' * (len(some) > 1)}"
                 say(f"Slurm: {count} as {arrays[-1]}; logs in {folder}")
-                if stop.asked:
+                if stop.requested:
                     break
-            if arrays or stop.asked:
+            if arrays or stop.requested:
                 _wait(arrays, self.config.progress != "none", stop)
         return []
 
@@ -155,7 +155,7 @@ def _wait(arrays: Sequence[str], telling: bool, stop: Stop) -> None:
     """Wait until no array has a job waiting or running; a signal interrupts."""
     pause, before, answered = 1.0, "", time.monotonic()
     names = " ".join(arrays)
-    while not stop.asked:
+    while not stop.requested:
         listed, why = _squeue("--me", "--array", "--format=%F %T")
         if listed is None:
             if before != why:

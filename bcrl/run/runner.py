@@ -43,7 +43,7 @@ def run(*plans: Plan) -> None:
     with stop.on_signals():
         for plan in plans:
             _prepare(plan, quiet)
-        while (jobs := ordered(plans, failed)) and not stop.asked:
+        while (jobs := ordered(plans, failed)) and not stop.requested:
             _search_references([job.plan for job in jobs])
             if busy := _train(jobs, options, failed, stop):
                 _wait(busy, quiet, stop)
@@ -133,7 +133,9 @@ def _train(
             plan, seeds = jobs[number].plan, jobs[number].seeds
             if isinstance(outcome, Died):
                 lost = set(records.pending(plan)).intersection(seeds)
-                died = dict.fromkeys(() if stop.asked else sorted(lost), str(outcome))
+                died = dict.fromkeys(
+                    () if stop.requested else sorted(lost), str(outcome)
+                )
                 outcome = job.Outcome(died)
             if outcome.failed:
                 failed.setdefault(plan.directory, {}).update(outcome.failed)
@@ -151,7 +153,7 @@ def _outcomes(
         yield from do_jobs(job.train, jobs, workers, tick, stop)
         return
     for number, each in enumerate(jobs):
-        if stop.asked:
+        if stop.requested:
             return
         yield number, job.train(each, partial(tick, number), stop)
 
@@ -164,7 +166,7 @@ def _wait(busy: Sequence[locks.Lock], quiet: bool, stop: Stop) -> None:
         more = f", and {len(busy) - 1} more are" * (len(busy) > 1)
         say(f"waiting: {held}{more}")
     pause = 0.1
-    while not stop.asked:
+    while not stop.requested:
         for lock in busy:
             if lock.acquire():
                 lock.release()

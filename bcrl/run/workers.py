@@ -86,7 +86,7 @@ def do_jobs(
             busy: dict[Any, _Worker] = {w.pipe: w for w in pool if w.job >= 0}
             if not busy:
                 return
-            if stop.asked and not stopped:
+            if stop.requested and not stopped:
                 waiting, stopped = [], True
                 for worker in busy.values():
                     worker.send(None)
@@ -119,14 +119,14 @@ class _StopByPipe:
     """A worker's stop: a message from its parent, or the parent's end."""
 
     def __init__(self, pipe: connection.Connection) -> None:
-        self._pipe, self._asked, self._next = pipe, False, 0.0
+        self._pipe, self._requested, self._next = pipe, False, 0.0
 
     @property
-    def asked(self) -> bool:
+    def requested(self) -> bool:
         """Whether to stop; the pipe is polled ten times per second at most."""
         if (now := time.monotonic()) > self._next:
-            self._asked, self._next = self._pipe.poll(), now + 0.1
-        return self._asked
+            self._requested, self._next = self._pipe.poll(), now + 0.1
+        return self._requested
 
 
 def _serve(do: Do, pipe: connection.Connection) -> None:

@@ -103,7 +103,7 @@ def test_an_interrupted_run_logs_nothing_twice(tmp_path, monkeypatch):
         measure(training, snapshot)
         seen.append(snapshot.count)
         if len(seen) == 7:
-            stops[0].ask()
+            stops[0].request()
 
     def stoppable(job, tick, stop):
         stops.append(stop)
