@@ -13,7 +13,7 @@ import pytest
 
 from bcrl.common import files, terminal
 from bcrl.common.divergence import diverging
-from bcrl.report import style
+from bcrl.report.figures import style
 
 
 def no_home() -> Path:
