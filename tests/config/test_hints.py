@@ -12,7 +12,7 @@ from bcrl import cli
 from bcrl.config import guard, shell, vetting
 from bcrl.errors import BcrlError
 from bcrl.report import cli as report
-from bcrl.report import verify
+from bcrl.results import verify
 from bcrl.run import runner, status
 from tests.conftest import plan, plans
 

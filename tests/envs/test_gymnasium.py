@@ -182,7 +182,7 @@ def test_lanes_out_of_a_checkpoint_go_on_in_the_middle_of_an_episode(tmp_path):
         state = lanes.restart(over, rng.random((4, 1)), state)
     with open(tmp_path / "x.npz", "wb") as file:
         serialization.write(file, {}, lanes, [task])
-    again = serialization.read(tmp_path / "x.npz", [task])
+    again = serialization.read_content(tmp_path / "x.npz", [task])
     assert not again.running  # no simulator is stored
     for action in rng.integers(2, size=(5, 4)):
         for a, b in zip(
