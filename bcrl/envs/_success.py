@@ -1,10 +1,10 @@
-"""When an episode of a simulator counts as solved: named rules, and a default."""
+"""When an episode counts as solved: named rules, and a default for simulators."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-#: The rules of `env.success`, and what each one asks of an episode.
+#: The rules of `env.success`, and the condition that solves an episode.
 RULES = {
     "absorbed": "the episode terminated",
     "survived": "the episode was truncated, it never terminated",
@@ -13,12 +13,10 @@ RULES = {
     "threshold": "the undiscounted return reached env.success_threshold",
     "info": 'info["is_success"] or info["success"] held after the last step',
 }
-#: Where simulators report success themselves.
-KEYS = ("is_success", "success")
 
 
 class Success(NamedTuple):
-    """A rule by name; `threshold` is the return that the rule of that name needs."""
+    """A rule by name; `threshold` is the return that the rule `threshold` needs."""
 
     rule: str = "unpunished"
     threshold: float = 0.0
@@ -29,17 +27,19 @@ class Success(NamedTuple):
         return f"threshold (the undiscounted return reached {self.threshold:g})"
 
 
-def default(reports: bool, low: float, high: float, threshold: float | None) -> Success:
-    """The rule that suits what random play has shown.
+def default_success(
+    reports: bool, low: float, high: float, threshold: float | None
+) -> Success:
+    """The rule that suits the rewards of random play.
 
     `reports`: info has a success key. `low`, `high`: least and largest reward of the
     steps that did not terminate. `threshold`: the registered `reward_threshold`.
     """
     if reports:
         return Success("info")
-    if low == high:  # each step costs the same, pays the same, or says nothing
+    if low == high:  # every step costs the same, pays the same, or gives 0
         return Success("absorbed" if low < 0 else "survived" if low > 0 else "rewarded")
-    if threshold is not None and not (high < 0 < threshold):
+    if threshold is not None and not high < 0 < threshold:
         return Success("threshold", float(threshold))
     if threshold is None and high < 0:
         return Success("absorbed")

@@ -12,8 +12,8 @@ from torch.nn import functional
 from bcrl.api import DQN, FQI, Boost, Forest, Gymnasium, run, stages
 from bcrl.common import serialization
 from bcrl.common.seeding import stream
-from bcrl.envs._success import default
-from bcrl.envs._trial import coarse, trial
+from bcrl.envs._success import default_success
+from bcrl.envs.checks import unresolved
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.evaluation.step_metrics import evaluate
 from bcrl.learning.rollout import draws, play, start_states, success_of
@@ -225,12 +225,12 @@ def test_equal_tasks_have_equal_hashes():
 def test_shipped_curricula_apply_their_parameters(env):
     tasks = plan(f"env={env}").tasks
     for task in tasks:
-        there = task.simulator().unwrapped
+        there = task.recipe.make().unwrapped
         for key, value in task.attributes.items():
             assert getattr(there, key) == value
     if env == "cart_pole":
         for task in tasks:
-            there = task.simulator().unwrapped
+            there = task.recipe.make().unwrapped
             derived = there.masspole * there.length
             assert there.polemass_length == pytest.approx(derived)
 
@@ -406,8 +406,8 @@ def test_what_is_solved_is_what_a_plain_loop_finds(name):
         env.reset(seed=int(number * 2**31))
         rewards, over = [], False
         while not over:
-            action = found.action[0, lane, len(rewards)] + task.first_action
-            _, reward, end, cut, info = env.step(int(action))
+            action = int(found.action[0, lane, len(rewards)] + env.action_space.start)
+            _, reward, end, cut, info = env.step(action)
             rewards.append(reward)
             over = end or cut
         if expected is None:
@@ -435,7 +435,7 @@ def test_what_is_solved_is_what_a_plain_loop_finds(name):
     ],
 )
 def test_the_default_rule(reports, low, high, registered, rule):
-    assert default(reports, low, high, registered).rule == rule
+    assert default_success(reports, low, high, registered).rule == rule
 
 
 @pytest.mark.parametrize(
@@ -480,7 +480,7 @@ def test_wrappers_of_foreign_packages_need_trust():
 def test_a_component_that_float32_does_not_resolve_is_noted(offset, scale, note):
     cells = np.random.default_rng(0).integers(7, size=(200, 1))
     seen = np.hstack([np.cos(cells), offset + scale * cells])
-    assert [text.split()[1] for text in coarse(seen)] == ["1"] * note
+    assert [text.split()[1] for text in unresolved(seen)] == ["1"] * note
 
 
 def test_a_replay_that_ends_elsewhere_fails_its_lane():
@@ -496,7 +496,7 @@ def test_a_replay_that_ends_elsewhere_fails_its_lane():
     assert not lanes.restart(np.ones(3, bool), np.full((3, 1), 0.5), after)[1].any()
 
 
-def test_what_is_flattened_is_said_by_the_wrappers_name():
-    (said,) = trial(Gymnasium("FrozenLake-v1")).adapted
-    assert "Discrete(16)" in said and "FlattenObservation" in said
-    assert trial(Gymnasium("CartPole-v1")).adapted == ()
+def test_a_note_names_the_flattened_space_and_the_wrapper():
+    (note,) = Gymnasium("FrozenLake-v1").trial.adapted
+    assert "Discrete(16)" in note and "FlattenObservation" in note
+    assert not Gymnasium("CartPole-v1").trial.adapted
