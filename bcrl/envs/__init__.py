@@ -7,8 +7,7 @@ from collections.abc import Sequence
 
 from bcrl.common import plugins
 from bcrl.common.registration import REGISTERED
-from bcrl.envs._success import Success
-from bcrl.envs.base import Env, FiniteEnv, is_finite, is_simulated, lanes_of
+from bcrl.envs.base import Env, FiniteEnv, Success, is_finite, is_simulated, lanes_of
 from bcrl.envs.checks import check_pure_tasks
 from bcrl.errors import BcrlError, ConfigError, did_you_mean
 

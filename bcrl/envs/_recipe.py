@@ -25,23 +25,17 @@ WRAPPERS = (
     *("RescaleAction", "RescaleObservation", "ReshapeObservation"),
     *("ResizeObservation", "StickyAction"),
 )
-#: Packages whose import registers environments; they need no BCRL_TRUST.
-#: By module: its name for pip, and the beginnings of its ids.
-PACKAGES = {
-    "ale_py": ("ale-py", ("ALE/",)),
-    "bcrl": ("boosted-curriculum-rl", ()),
-    "gymnasium": ("gymnasium", ()),
-    "gymnasium_robotics": (
-        "gymnasium-robotics",
-        ("Fetch", "HandReach", "HandManipulate", "PointMaze", "AntMaze", "Adroit"),
-    ),
-    "highway_env": (
-        "highway-env",
-        ("highway-", "merge-", "roundabout-", "parking-", "intersection-"),
-    ),
-    "minigrid": ("minigrid", ("MiniGrid-", "BabyAI-")),
-    "miniworld": ("miniworld", ("MiniWorld-",)),
-    "shimmy": ("shimmy", ("dm_control/", "bsuite/")),
+#: Packages whose import registers environments, and the beginnings of their ids; they
+#: need no BCRL_TRUST. Their names for pip have hyphens.
+PACKAGES: dict[str, tuple[str, ...]] = {
+    "ale_py": ("ALE/",),
+    "bcrl": (),
+    "gymnasium": (),
+    "gymnasium_robotics": ("Fetch", "Hand", "PointMaze", "AntMaze", "Adroit"),
+    "highway_env": ("highway-", "merge-", "roundabout-", "parking-", "intersection-"),
+    "minigrid": ("MiniGrid-", "BabyAI-"),
+    "miniworld": ("MiniWorld-",),
+    "shimmy": ("dm_control/", "bsuite/"),
 }
 _RESERVED = ("max_episode_steps", "disable_env_checker")  # arguments that bcrl sets
 
@@ -106,21 +100,25 @@ def spec_of(name: str) -> EnvSpec:
     module, colon, name_there = name.rpartition(":")
     if colon:
         if module in PACKAGES and not importlib.util.find_spec(module):
-            why = f"the package {module} isn't installed: "
-            raise ConfigError("env.id", name, f"{why}pip install {PACKAGES[module][0]}")
+            why = f"the package {module} isn't installed: {_pip(module)}"
+            raise ConfigError("env.id", name, why)
         plugins.module("env.id", name, module, PACKAGES)
     if name_there in gymnasium.registry:
         return gymnasium.registry[name_there]
-    for module, (package, beginnings) in PACKAGES.items():
+    for module, beginnings in PACKAGES.items():
         if name_there.startswith(beginnings):
             missing = not importlib.util.find_spec(module)
-            first = f"pip install {package}, then " if missing else ""
+            first = f"{_pip(module)}, then " if missing else ""
             why = f"{first}env.id={module}:{name_there} imports the package first"
             raise ConfigError("env.id", name, why)
     similar = closest(name_there, gymnasium.registry)
     hint = f"did you mean env.id={similar}? " if similar else ""
     why = f"isn't registered; {hint}env.id=module:Name-v0 imports the module first"
     raise ConfigError("env.id", name, why)
+
+
+def _pip(module: str) -> str:
+    return f"pip install {module.replace('_', '-')}"
 
 
 def _parameters(creator: Any) -> dict[str, inspect.Parameter]:

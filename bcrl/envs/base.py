@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Any, ClassVar, Protocol, TypeGuard, cast
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeGuard, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,16 @@ Bools = NDArray[np.bool_]
 Step = tuple[
     Floats, Floats, Bools
 ]  # next state (..., d), reward (...), absorbing (...)
+
+#: Rules by which an episode counts as solved: docs/gymnasium.md.
+RULES = ("absorbed", "survived", "unpunished", "rewarded", "threshold", "info")
+
+
+class Success(NamedTuple):
+    """One of RULES; `threshold` is the return that the rule `threshold` needs."""
+
+    rule: str = "unpunished"
+    threshold: float = 0.0
 
 
 class Env(Protocol):

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from bcrl.common.checks import one_of
 from bcrl.common.terminal import say
-from bcrl.envs._success import RULES
-from bcrl.envs.base import Env, Floats, check_episodes
+from bcrl.envs.base import RULES, Env, Floats, check_episodes
 from bcrl.errors import ConfigError
 
 LARGEST = float(np.finfo(np.float32).max)  # learners see float32

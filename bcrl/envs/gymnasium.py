@@ -15,11 +15,22 @@ from numpy.typing import NDArray
 
 from bcrl.common.checks import one_of
 from bcrl.envs._recipe import Recipe, spec_of
-from bcrl.envs._success import RULES, default_success
-from bcrl.envs.base import Floats, Ints, check_episodes
-from bcrl.envs.checks import check_different, note_resolution, once, unresolved
-from bcrl.envs.simulators import SimulatedLanes, Simulator, is_plain, reset_seed
-from bcrl.errors import ConfigError, at_least
+from bcrl.envs.base import RULES, Floats, Ints, check_episodes
+from bcrl.envs.checks import (
+    check_different,
+    described,
+    note_resolution,
+    once,
+    unresolved,
+)
+from bcrl.envs.simulators import (
+    SimulatedLanes,
+    Simulator,
+    is_plain,
+    reset_seed,
+    shortened,
+)
+from bcrl.errors import BcrlError, ConfigError, at_least
 
 TRIES = 5  # random episodes that are played in every task before any work,
 STEPS = 10_000  # with so many steps altogether
@@ -107,9 +118,9 @@ class Gymnasium:
                 raise ConfigError("env.success_threshold", threshold, why)
             return "threshold", float(threshold)
         if rule == "auto":
-            found = default_success(seen.reports, seen.low, seen.high, registered)
-            once(f"env.id={self.id}: solved is env.success={found}")
-            rule = found.rule
+            rule = default_success(seen.reports, seen.low, seen.high, registered)
+            value = f" (a return of {registered})" if rule == "threshold" else ""
+            once(f"env.id={self.id}: an episode is solved if env.success={rule}{value}")
         if rule != "threshold":
             return rule, None
         if registered is None:
@@ -157,10 +168,15 @@ class Gymnasium:
         simulator = Simulator(self.recipe, self.state_dim, render_mode="rgb_array")
         try:
             simulator.reset(reset_seed(start[0]))
-            yield simulator.render()
-            for action in actions.tolist():
-                simulator.step(action)
-                yield simulator.render()
+            for action in [*actions.tolist(), None]:
+                picture: Any = simulator.env.render()
+                yield picture
+                if action is not None:
+                    simulator.step(action)
+        except Exception as error:  # of foreign code
+            hint = "it may need pip install 'boosted-curriculum-rl[rendering]'"
+            why = f"{self.id} draws no picture ({described(error)}); {hint}"
+            raise BcrlError(why) from error
         finally:
             simulator.close()
 
@@ -231,7 +247,10 @@ def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
     finally:
         for simulator in simulators:
             simulator.close()
-    adapted = list(dict.fromkeys(note for s in simulators for note in s.adapted))
+    adapted = []
+    if recipe.observation is None and not isinstance(first.space, spaces.Box):
+        note = f"observations, {shortened(first.space)}, are flattened to "
+        adapted.append(f"{note}{first.state_dim} numbers, as by FlattenObservation")
     unsteady = _unsteady(recipe, actions, trace, False) if verify else ""
     fresh = bool(unsteady) and not _unsteady(recipe, actions, trace, True)
     if fresh:
@@ -248,6 +267,25 @@ def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
         min(rewards, default=0.0),
         max(rewards, default=0.0),
     )
+
+
+def default_success(
+    reports: bool, low: float, high: float, threshold: float | None
+) -> str:
+    """The rule of `env.success` that suits the rewards of random play.
+
+    `reports`: info has a success key. `low`, `high`: least and largest reward of the
+    steps that did not terminate. `threshold`: the registered `reward_threshold`.
+    """
+    if reports:
+        return "info"
+    if low == high:  # every step costs the same, pays the same, or gives 0
+        return "absorbed" if low < 0 else "survived" if low > 0 else "rewarded"
+    if threshold is not None and not high < 0 < threshold:
+        return "threshold"
+    if threshold is None and high < 0:
+        return "absorbed"
+    return "survived" if low > 0 else "rewarded"
 
 
 def _episode(simulator: Simulator, number: int, actions: list[int]) -> Iterator[tuple]:

@@ -55,9 +55,8 @@ class Simulator:
     ) -> None:
         self.recipe, self.state_dim, self.fresh = recipe, state_dim, fresh
         self.render_mode = render_mode
-        self.adapted: dict[str, None] = {}  # notes about answers that were converted
         self.reports = False  # whether info has a success key
-        self.map = recipe.mapping()
+        self._map = recipe.mapping()
         self._open()
 
     def _open(self) -> None:
@@ -90,8 +89,8 @@ class Simulator:
     def step(self, action: int) -> Outcome:
         """The outcome of one step with an action counted from 0."""
         answer = self._call("step", self.env.step, action + self._first_action)
-        expected = "observation, reward, terminated, truncated and info"
-        seen, reward, ended, cut, info = self._values("step", answer, 5, expected)
+        names = "observation, reward, terminated, truncated and info"
+        seen, reward, ended, cut, info = self._values("step", answer, 5, names)
         return (
             self._vector("step", seen),
             self._plain("reward", reward, float),
@@ -99,16 +98,6 @@ class Simulator:
             self._plain("truncated", cut, bool),
             self._success("step", info),
         )
-
-    def render(self) -> NDArray[np.uint8]:
-        """The environment's own picture; BcrlError if it draws none."""
-        try:
-            picture: Any = self.env.render()
-            return picture
-        except Exception as error:  # of foreign code
-            hint = "it may need pip install 'boosted-curriculum-rl[rendering]'"
-            why = f"{self.recipe.id} draws no picture ({described(error)}); {hint}"
-            raise BcrlError(why) from error
 
     def broken(self, method: str, problem: str, expected: str) -> BrokenSimulator:
         """The error that names the environment, method, problem and expected answer."""
@@ -137,25 +126,16 @@ class Simulator:
         raise self.broken(method, f"gave {_shown(answer)}", expected)
 
     def _vector(self, method: str, seen: Any) -> Floats:
-        """An observation as a new vector (d,)."""
-        if self.map is not None:
-            method = f"env.observation={self.recipe.observation}"
-            seen = self._call(method, self.map, seen)
-            vector = self._numbers(method, seen).reshape(-1)
-        else:
-            vector = self._flattened(method, self.space, seen)
-        if not vector.size:
-            raise self.broken(method, "gave nothing", "at least one number")
-        if not self.state_dim:
-            self.state_dim = len(vector)
-            if self.map is None and not isinstance(self.space, spaces.Box):
-                text = f"observations, {_short(self.space)}, are flattened to "
-                text += f"{len(vector)} numbers, as by FlattenObservation"
-                self.adapted[text] = None
-        if len(vector) != self.state_dim:
-            expected = f"{self.state_dim}, as many as after the first reset"
+        """An observation as a new vector (d,) of finite numbers."""
+        space = self.space
+        if self._map is not None:
+            method, space = f"env.observation={self.recipe.observation}", None
+            seen = self._call(method, self._map, seen)
+        vector = np.array(self._flat(method, space, seen), np.float64)
+        d = self.state_dim = self.state_dim or len(vector)
+        if len(vector) != max(d, 1):
+            expected = f"{max(d, 1)} or, at the first reset, more"
             raise self.broken(method, f"gave {len(vector)} numbers", expected)
-        vector = np.array(vector, np.float64)
         if not np.abs(vector).max() <= LARGEST:
             place = np.flatnonzero(~(np.abs(vector) <= LARGEST))[0]
             problem = f"gave an observation with {vector[place]} as component {place}"
@@ -164,59 +144,40 @@ class Simulator:
             raise self.broken(method, problem, expected)
         return vector
 
-    def _numbers(self, method: str, seen: Any) -> NDArray:
-        array = self._call(method, np.asarray, seen)
-        if array.dtype.kind not in "biuf":
-            raise self.broken(
-                method, f"gave {_shown(seen)}", "an array of real numbers"
-            )
-        return array
-
-    def _flattened(self, method: str, space: spaces.Space, seen: Any) -> NDArray:
-        """A member of `space` as a vector; its numbers keep their precision."""
-        if isinstance(space, spaces.Box):
-            array = self._numbers(method, seen)
-            if array.shape != space.shape:
-                if array.size != math.prod(space.shape):
-                    expected = f"shape {space.shape}, as observation_space declares"
-                    raise self.broken(method, f"gave {_shown(seen)}", expected)
-                text = f"observations of shape {array.shape} are taken as of shape "
-                self.adapted[f"{text}{space.shape}"] = None
-            return array.reshape(-1)
+    def _flat(self, method: str, space: spaces.Space | None, seen: Any) -> NDArray:
+        """A member of `space` (None: any numbers) as a vector, without a cast."""
         parts = _parts(space)
-        if parts is None:
-            if self._call(method, space.contains, seen):
-                return self._call(method, spaces.flatten, space, seen)
-        elif isinstance(
-            seen, dict if isinstance(space, spaces.Dict) else (tuple, list)
-        ):
-            keys = seen.keys() if isinstance(seen, dict) else range(len(seen))
-            if set(keys) == set(parts):
-                found = [
-                    self._flattened(f"{method} [{key!r}]", part, seen[key])
+        if parts is not None:
+            sequence = isinstance(seen, (tuple, list))
+            keys = range(len(seen)) if sequence else seen
+            if (sequence or isinstance(seen, dict)) and set(keys) == parts.keys():
+                found = (
+                    self._flat(f"{method} [{key!r}]", part, seen[key])
                     for key, part in parts.items()
-                ]
+                )
                 return np.concatenate([np.empty(0), *found])
-        expected = f"a member of {_short(space)}"
+        elif space is None or isinstance(space, spaces.Box):
+            array = self._call(method, np.asarray, seen)
+            fits = space is None or array.size == math.prod(space.shape)
+            if fits and array.dtype.kind in "biuf":
+                return array.reshape(-1)
+        elif self._call(method, space.contains, seen):
+            return self._call(method, spaces.flatten, space, seen)
+        expected = "real numbers" + (
+            f", a member of {shortened(space)}" if space else ""
+        )
         raise self.broken(method, f"gave {_shown(seen)}", expected)
 
-    def _plain(self, name: str, value: Any, kind: Callable[[Any], Any]) -> Any:
+    def _plain(self, name: str, value: Any, kind: type[float]) -> Any:
         """One finite number (kind float) or one boolean, from an array or a scalar."""
-        if type(value) is kind and (kind is bool or math.isfinite(value)):
+        if type(value) is kind and math.isfinite(value):
             return value
         array = self._call(f"step's {name}", np.asarray, value)
-        boolean = kind is bool
-        one = array.size == 1 and array.dtype.kind in "biuf"
-        if not one or not (_is_boolean(array) if boolean else np.isfinite(array).all()):
-            expected = "True or False" if boolean else "one finite real number"
+        allowed = _is_boolean(array) if kind is bool else _is_finite(array)
+        if array.size != 1 or not allowed:
+            expected = "True or False" if kind is bool else "one finite real number"
             raise self.broken("step", f"gave {name} {_shown(value)}", expected)
-        if array.ndim or (boolean and array.dtype.kind != "b"):
-            shape = f"arrays of shape {array.shape}" if array.ndim else array.dtype
-            text = (
-                f"{name}, {shape}, is taken as a {'boolean' if boolean else 'number'}"
-            )
-            self.adapted[text] = None
-        return kind(array.reshape(-1)[0])
+        return kind(array.item())
 
     def _success(self, method: str, info: Any) -> bool:
         """Whether info reports a success; a rate, a text or None reports nothing."""
@@ -377,13 +338,35 @@ def is_plain(space: spaces.Space) -> bool:
     return all(map(is_plain, parts.values()))
 
 
-def _parts(space: spaces.Space) -> dict[Any, spaces.Space] | None:
+def shortened(value: Any) -> str:
+    """The first 70 characters of a value in a message."""
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:  # of foreign code
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= 70 else f"{text[:69]}…"
+
+
+def _shown(value: Any) -> str:
+    """A wrong value in a message, with its type."""
+    if isinstance(value, (tuple, list)):
+        return f"{len(value)} values, {shortened(value)},"
+    if isinstance(value, np.ndarray) and value.ndim:
+        return f"an array of shape {value.shape} and type {value.dtype}"
+    return f"{shortened(value)}, of type {type(value).__name__},"
+
+
+def _parts(space: spaces.Space | None) -> dict[Any, spaces.Space] | None:
     """The spaces inside a Dict or Tuple by key or place; None for other spaces."""
     if isinstance(space, spaces.Dict):
         return space.spaces
     if isinstance(space, spaces.Tuple):
         return dict(enumerate(space.spaces))
     return None
+
+
+def _is_finite(array: NDArray) -> bool:
+    return array.dtype.kind in "biuf" and bool(np.isfinite(array).all())
 
 
 def _is_boolean(array: NDArray) -> bool:
@@ -394,20 +377,3 @@ def _is_boolean(array: NDArray) -> bool:
 def _close(env: gymnasium.Env) -> None:
     with suppress(Exception):  # no result depends on it
         env.close()
-
-
-def _shown(value: Any) -> str:
-    """A wrong value for a message, with its type."""
-    if isinstance(value, (tuple, list)):
-        return f"{len(value)} values, {_short(value)},"
-    if isinstance(value, np.ndarray) and value.ndim:
-        return f"an array of shape {value.shape} and type {value.dtype}"
-    return f"{_short(value)}, of type {type(value).__name__},"
-
-
-def _short(value: Any) -> str:
-    try:
-        text = " ".join(repr(value).split())
-    except Exception:  # of foreign code, too
-        text = f"a {type(value).__name__}"
-    return text if len(text) <= 70 else f"{text[:69]}…"

@@ -242,7 +242,10 @@ REJECTED = {
         see(lambda at: np.array(5.0), Tuple((box(1),))),
         ("reset", "5.", "member of Tuple"),
     ),
-    "NothingInside": (see(lambda at: {}, Dict({})), ("reset", "nothing", "one number")),
+    "NothingInside": (
+        see(lambda at: {}, Dict({})),
+        ("reset", "0 numbers", "expected 1"),
+    ),
     "NotANumber": (
         see(lambda at: np.array([at or np.nan])),
         ("step", "nan", "finite"),

@@ -12,8 +12,8 @@ from torch.nn import functional
 from bcrl.api import DQN, FQI, Boost, Forest, Gymnasium, run, stages
 from bcrl.common import serialization
 from bcrl.common.seeding import stream
-from bcrl.envs._success import default_success
 from bcrl.envs.checks import unresolved
+from bcrl.envs.gymnasium import default_success
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.evaluation.step_metrics import evaluate
 from bcrl.learning.rollout import draws, play, start_states, success_of
@@ -286,7 +286,7 @@ def test_an_id_of_the_command_names_the_folder():
 
 BAD = {
     "no id": ([], "env.id"),
-    "a misspelt id": (["env.id=CartPol-v1"], "did you mean CartPole-v1?"),
+    "a misspelt id": (["env.id=CartPol-v1"], "did you mean env.id=CartPole-v1?"),
     "a foreign module": (["env.id=os:CartPole-v1"], "BCRL_TRUST=os"),
     "continuous actions": (["env.id=Pendulum-v1"], "{name: DiscretizeAction"),
     "no horizon": (["env.id=tests/Endless-v0"], "env.horizon"),
@@ -435,7 +435,7 @@ def test_what_is_solved_is_what_a_plain_loop_finds(name):
     ],
 )
 def test_the_default_rule(reports, low, high, registered, rule):
-    assert default_success(reports, low, high, registered).rule == rule
+    assert default_success(reports, low, high, registered) == rule
 
 
 @pytest.mark.parametrize(

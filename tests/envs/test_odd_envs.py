@@ -177,7 +177,7 @@ def test_no_cast_hides_what_float32_cannot_resolve():
     seen = np.array([1.7e9 + 3])
     space = spaces.Dict({"time": spaces.Box(-np.inf, np.inf, (1,), np.float32)})
     simulator = Simulator(Recipe("odd/Walk-v0"))
-    assert simulator._flattened("reset", space, {"time": seen})[0] == seen[0]
+    assert simulator._flat("reset", space, {"time": seen})[0] == seen[0]
 
 
 def test_a_registered_threshold_of_zero_is_one():
