@@ -11,7 +11,6 @@ import functools
 import sys
 import traceback
 from collections.abc import Hashable, Sequence
-from dataclasses import fields
 from itertools import pairwise
 from numbers import Real
 from pathlib import Path
@@ -99,7 +98,7 @@ def check_different(
 
 def _difference(one: Any, other: Any) -> str:
     """The constants in which two tasks differ."""
-    names = [each.name for each in fields(one) if each.compare]
+    names = getattr(one, "__dataclass_fields__", ())
     pairs = [(name, getattr(one, name), getattr(other, name)) for name in names]
     changes = [f"{name}: {a} → {b}" for name, a, b in pairs if a != b]
     return ", ".join(changes) or "the same task twice"

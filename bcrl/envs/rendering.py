@@ -90,18 +90,15 @@ def draw(
     vectors = getattr(env, "actions", None)
     if action is not None and np.ndim(action) == 0 and vectors is not None:
         action = vectors[action]
-    canvas = _drawing(env)[0](env, np.asarray(path, float), action)
+    drawing = DRAWINGS.get(type(env).__module__, _bars)
+    canvas = drawing(env, np.asarray(path, float), action)
     canvas.text(12, SIZE - 10, caption, "ld")
     return canvas.picture()
 
 
 def frames_per_second(env: Env) -> int:
     """The number of steps that an animation shows per second."""
-    return _drawing(env)[1]
-
-
-def _drawing(env: Env) -> tuple[Callable[..., Canvas], int]:
-    return DRAWINGS.get(type(env).__module__, (_bars, 10))
+    return 20 if type(env).__module__ == "bcrl.envs.linear_system" else 10
 
 
 def _height(p: Any) -> Any:
@@ -138,11 +135,9 @@ def _car_on_hill(env: Any, path: Floats, force: Any) -> Canvas:
         side = np.sign(force[0])
         start = foot + np.array([0.15 * side, 0.09]) @ axes
         canvas.arrow(start, 0.25 * side * along, ORANGE, 4)
-    y, half, end = -0.62, 0.8, 0.8 * min(max(speed / 3.0, -1.0), 1.0)
-    canvas.rectangle(-half, y - 0.025, half, y + 0.025, PAPER)
-    canvas.rectangle(min(0, end), y - 0.025, max(0, end), y + 0.025, BLUE)
-    for x, colour in ((-half, VERMILION), (0.0, GREY), (half, VERMILION)):
-        canvas.line([(x, y - 0.05), (x, y + 0.05)], colour, 2)
+    end = 0.8 * min(max(speed / 3.0, -1.0), 1.0)  # a gauge of the speed
+    canvas.rectangle(-0.8, -0.645, 0.8, -0.595, PAPER)
+    canvas.rectangle(min(0, end), -0.645, max(0, end), -0.595, BLUE)
     canvas.text(SIZE // 2, 312, f"{speed:+.2f} m/s", "mm")
     canvas.text(12, 10, f"Car on the hill, {env.mass:g} kg")
     return canvas
@@ -219,9 +214,9 @@ def _bars(env: Any, path: Floats, force: Any) -> Canvas:
     return canvas
 
 
-#: An environment's module → its drawing, and the steps that are shown per second.
-DRAWINGS: dict[str, tuple[Callable[..., Canvas], int]] = {
-    "bcrl.envs.car_on_hill": (_car_on_hill, 10),
-    "bcrl.envs.maze": (_maze, 10),
-    "bcrl.envs.linear_system": (_linear_system, 20),
+#: An environment's module → its drawing.
+DRAWINGS: dict[str, Callable[..., Canvas]] = {
+    "bcrl.envs.car_on_hill": _car_on_hill,
+    "bcrl.envs.maze": _maze,
+    "bcrl.envs.linear_system": _linear_system,
 }

@@ -350,10 +350,10 @@ def shortened(value: Any) -> str:
 def _shown(value: Any) -> str:
     """A wrong value in a message, with its type."""
     if isinstance(value, (tuple, list)):
-        return f"{len(value)} values, {shortened(value)},"
+        return f"{len(value)} values: {shortened(value)}"
     if isinstance(value, np.ndarray) and value.ndim:
         return f"an array of shape {value.shape} and type {value.dtype}"
-    return f"{shortened(value)}, of type {type(value).__name__},"
+    return f"{shortened(value)} of type {type(value).__name__}"
 
 
 def _parts(space: spaces.Space | None) -> dict[Any, spaces.Space] | None:

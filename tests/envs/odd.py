@@ -41,7 +41,7 @@ class Walk(gymnasium.Env):
         return int(self.np_random.integers(2, 6))
 
     def see(self):
-        return np.array([float(self.at)])
+        return cell(self.at)
 
     def step(self, action):
         self.steps += 1
@@ -63,23 +63,30 @@ def give(function):
     return {"give": lambda self, *found: function(*found)}
 
 
+def rewards(function):
+    return give(lambda s, r, end: (s, function(r), end, False, {}))
+
+
+def ends(function, cut=False):
+    return give(lambda s, r, end: (s, r, function(end), cut, {}))
+
+
 def first(function):
-    """A walk whose reset calls `function` of itself and the seed, and then starts."""
+    """A walk whose reset calls `function` of the seed, and then starts."""
 
     def start(self, seed):
-        function(self, seed)
+        function(seed)
         return Walk.first(self, seed)
 
     return {"first": start}
 
 
-def fails(error):
-    """A function that raises."""
+def fail(error):
+    raise error
 
-    def function(*_, **__):
-        raise error
 
-    return function
+def cell(at):
+    return np.array([float(at)])
 
 
 class ActionsFrom5(Walk):
@@ -135,201 +142,143 @@ class OneBuffer(Walk):
         return self.buffer
 
 
+COARSE = Dict({"at": box(1, low=-9, high=9, dtype=np.int64)})
 #: They learn the same numbers as Walk.
 SAME = {
-    "RewardInAnArray": give(lambda s, r, end: (s, np.array([r]), end, False, {})),
-    "NumpyScalars": give(
-        lambda s, r, end: (s, np.float32(r), np.bool_(end), np.bool_(0), {})
-    ),
-    "EverythingInArrays": give(
-        lambda s, r, end: (s, np.array([[r]]), np.array([end]), np.array(False), {})
-    ),
-    "EndsInNumbers": give(lambda s, r, end: (s, r, int(end), np.int8(0), {})),
+    "RewardInAnArray": rewards(lambda r: np.array([r])),
+    "RewardInNumPy": rewards(np.float32),
+    "EndsInArrays": ends(lambda end: np.array([end]), np.array(False)),
+    "EndsInNumPy": ends(np.bool_, np.bool_(0)),
+    "EndsInNumbers": ends(int, np.int8(0)),
     "BothAtOnce": give(lambda s, r, end: (s, r, end, end, {})),
-    "OrderedInfo": give(
-        lambda s, r, end: (s, r, end, False, collections.OrderedDict(at=s))
-    ),
+    "OrderedInfo": give(lambda *found: (*found, False, collections.OrderedDict(a=1))),
     "ListsForArrays": see(lambda at: [at]),
     "Row": see(lambda at: np.array([[float(at)]])),
     "Bare": see(float, box()),
-    "InATuple": see(lambda at: (np.array([float(at)]),), Tuple((box(1),))),
-    "InADict": see(
-        lambda at: {"at": {"cell": np.array([float(at)])}},
-        Dict({"at": Dict({"cell": box(1)})}),
-    ),
-    "InACoarserDict": see(
-        lambda at: {"at": np.array([float(at)])},
-        Dict({"at": box(1, low=-9, high=9, dtype=np.int64)}),
-    ),
-    "LegacySeed": first(lambda self, seed: np.random.RandomState(seed)),
-    "SignedSeed": first(
-        lambda self, seed: np.array([seed]).astype(np.int32, casting="same_value")
-    ),
-    "SeedsTheGlobal": first(lambda self, seed: np.random.seed(seed % 1000)),  # noqa: NPY002
-    "CloseFails": {"close": fails(RuntimeError("nothing to close"))},
+    "InATuple": see(lambda at: (cell(at),), Tuple((box(1),))),
+    "InADict": see(lambda at: {"a": {"b": cell(at)}}, Dict(a=Dict(b=box(1)))),
+    "InACoarserDict": see(lambda at: {"at": cell(at)}, COARSE),
+    "LegacySeed": first(np.random.RandomState),
+    "SignedSeed": first(lambda n: np.array(n).astype(np.int32, casting="same_value")),
+    "SeedsTheGlobal": first(lambda seed: np.random.seed(seed % 1000)),  # noqa: NPY002
+    "CloseFails": {"close": lambda self: fail(RuntimeError("nothing to close"))},
 }
 CLASSES = [Walk, ActionsFrom5, ModeWithoutDefault, NoEarlyReset, WornByResets]
 CLASSES += [HoldsAFile, OneBuffer]
 
-#: Vectors that stand for the cell: what the walk shows, and the vector expected.
+
+def bits(at):
+    return np.array([at >> k & 1 for k in range(3)], np.int8)
+
+
+def picture(at):
+    return np.full((4, 5, 3), 30 * at, np.uint8)
+
+
+#: Vectors that stand for the cell: the expected vector, and what the walk shows.
 VECTORS = {
-    "Numbered": (see(int, Discrete(7)), lambda at: np.eye(7)[at]),
+    "Numbered": (lambda at: np.eye(7)[at], see(int, Discrete(7))),
     "Several": (
-        see(lambda at: np.array([at, at % 2]), MultiDiscrete([7, 2])),
         lambda at: np.r_[np.eye(7)[at], np.eye(2)[at % 2]],
+        see(lambda at: np.array([at, at % 2]), MultiDiscrete([7, 2])),
     ),
-    "Bits": (
-        see(
-            lambda at: np.array([at >> k & 1 for k in range(3)], np.int8),
-            MultiBinary(3),
-        ),
-        lambda at: np.array([at & 1, at >> 1 & 1, at >> 2 & 1], float),
-    ),
+    "Bits": (bits, see(bits, MultiBinary(3))),
     "Picture": (
-        see(
-            lambda at: np.full((4, 5, 3), 30 * at, np.uint8),
-            box(4, 5, 3, low=0, high=255, dtype=np.uint8),
-        ),
         lambda at: np.full(60, 30.0 * at),
+        see(picture, box(4, 5, 3, low=0, high=255, dtype=np.uint8)),
     ),
 }
-
-
 COUNTS = collections.Counter()  # what all simulators share
 
 
-def _shared(at):
+def shared(at):
     COUNTS["steps"] += 1
-    return np.array([float(at + COUNTS["steps"] % 5)])
+    return cell(at + COUNTS["steps"] % 5)
 
 
-def _late_dice(self, action):
+def late_dice(self, action):
     """Random without a seed, but only after many steps."""
     self.steps += 1
     noise = float.fromhex(os.urandom(4).hex()) if self.steps > 70 else 0.0
     return np.array([self.steps + noise]), -1.0, False, False, {}
 
 
-#: Rejected before any work: what is odd, and words of the message, which names the
-#: method, the answer and what is expected.
+LATER = first(lambda seed: COUNTS.update(episodes=1))
+LATER |= see(lambda at: cell(at + COUNTS["episodes"]))
+WORDS = Dict({"at": box(1), "goal": Text(9)})
+
+#: Rejected before any work: words of the message, which names the method, the answer
+#: and what is expected; and what is odd.
 REJECTED = {
-    "OldReset": (
-        {"reset": lambda self, *, seed=None, options=None: np.zeros(1)},
-        ("reset", "array", "0.26"),
-    ),
+    "OldReset": ("reset … array … 0.26", {"reset": lambda self, **_: np.zeros(1)}),
     "OldStep": (
+        "step … 4 values … truncated",
         give(lambda s, r, end: (s, r, end, {})),
-        ("step", "4 values", "truncated"),
     ),
     "NoSeed": (
+        "reset … seed … reset(*, seed=None, options=None)",
         {"reset": lambda self: Walk.reset(self)},
-        ("reset", "seed", "reset(*, seed=None, options=None)"),
     ),
-    "StepGivesNothing": (give(lambda *_: None), ("step", "None", "5 values")),
-    "OtherShape": ({"observation_space": box(3)}, ("reset", "(1,)", "(3,)")),
-    "Growing": (
-        see(lambda at: np.zeros(2 + (at == 0)), box(2)),
-        ("step", "(3,)", "(2,)"),
-    ),
-    "TextSeen": (see(lambda at: np.array([str(at)])), ("reset", "<U1", "numbers")),
-    "NothingSeen": (see(lambda at: None), ("reset", "None", "numbers")),
-    "OutOfNumbers": (see(int, Discrete(4)), ("Discrete(4)", "type int", "member")),
+    "StepGivesNothing": ("step … None … 5 values", give(lambda *_: None)),
+    "OtherShape": ("reset … (1,) … (3,)", {"observation_space": box(3)}),
+    "Growing": ("step … (3,) … (2,)", see(lambda at: np.zeros(2 + (at == 0)), box(2))),
+    "TextSeen": ("reset … <U1 … numbers", see(lambda at: np.array([str(at)]))),
+    "NothingSeen": ("reset … None … numbers", see(lambda at: None)),
+    "OutOfNumbers": ("Discrete(4) … type int … member", see(int, Discrete(4))),
     "KeyMissing": (
-        see(lambda at: {"a": np.zeros(1)}, Dict({"a": box(1), "b": box(1)})),
-        ("reset", "'a'", "'b'"),
+        "reset … 'a' … 'b'",
+        see(lambda at: {"a": cell(at)}, Dict(a=box(1), b=box(1))),
     ),
-    "NoTuple": (
-        see(lambda at: np.array(5.0), Tuple((box(1),))),
-        ("reset", "5.", "member of Tuple"),
-    ),
-    "NothingInside": (
-        see(lambda at: {}, Dict({})),
-        ("reset", "0 numbers", "expected 1"),
-    ),
-    "NotANumber": (
-        see(lambda at: np.array([at or np.nan])),
-        ("step", "nan", "finite"),
-    ),
-    "Huge": (see(lambda at: np.array([1e300 * at])), ("reset", "e+300", "float32")),
-    "RewardOfNothing": (
-        give(lambda s, r, end: (s, None, end, False, {})),
-        ("step", "reward None", "number"),
-    ),
-    "RewardAsText": (
-        give(lambda s, r, end: (s, str(r), end, False, {})),
-        ("step", "reward '-0.5'", "number"),
-    ),
-    "TwoRewards": (
-        give(lambda s, r, end: (s, np.array([r, r]), end, False, {})),
-        ("step", "(2,)", "number"),
-    ),
-    "EndlessReward": (
-        give(lambda s, r, end: (s, np.inf, end, False, {})),
-        ("step", "reward inf", "finite"),
-    ),
-    "EndsInWords": (
-        give(lambda s, r, end: (s, r, "done" if end else "", False, {})),
-        ("step", "terminated ''", "True or False"),
-    ),
-    "CutIsNothing": (
-        give(lambda s, r, end: (s, r, end, None, {})),
-        ("step", "truncated None", "True or False"),
-    ),
+    "NoTuple": ("reset … 5. … member of Tuple", see(lambda at: 5.0, Tuple((box(1),)))),
+    "NothingInside": ("reset … 0 numbers … 1", see(lambda at: {}, Dict({}))),
+    "NotANumber": ("step … nan … finite", see(lambda at: np.array([at or np.nan]))),
+    "Huge": ("reset … e+300 … float32", see(lambda at: np.array([1e300 * at]))),
+    "RewardOfNothing": ("step … reward None … number", rewards(lambda r: None)),
+    "RewardAsText": ("step … reward '-0.5' … number", rewards(str)),
+    "TwoRewards": ("step … (2,) … number", rewards(lambda r: np.array([r, r]))),
+    "EndlessReward": ("step … reward inf … finite", rewards(lambda r: np.inf)),
+    "EndsInWords": ("step … terminated '' … True or False", ends(lambda end: "")),
+    "CutIsNothing": ("step … truncated None … True or False", ends(bool, None)),
     "InfoIsNothing": (
-        give(lambda s, r, end: (s, r, end, False, None)),
-        ("step", "info None", "dict"),
+        "step … info None … dict",
+        give(lambda *found: (*found, False, None)),
     ),
     "NotMade": (
-        {"__init__": fails(OSError("no simulator on this machine"))},
-        ("constructor", "OSError: no simulator", "odd.py:"),
+        "constructor … OSError: no simulator … odd.py:",
+        {"__init__": lambda self: fail(OSError("no simulator here"))},
     ),
     "NoReset": (
-        first(fails(KeyError("no map"))),
-        ("reset", "KeyError: 'no map'", "odd.py:"),
+        "reset … KeyError: 'no map' … odd.py:",
+        first(lambda seed: fail(KeyError("no map"))),
     ),
     "NoStep": (
-        see(lambda at: np.array([float(at)]) if at else fails(IndexError("off"))()),
-        ("step", "IndexError: off", "odd.py:"),
+        "step … IndexError: off … odd.py:",
+        see(lambda at: cell(at) if at else fail(IndexError("off"))),
     ),
-    "Leaves": (
-        give(lambda *_: sys.exit("bye")),
-        ("step", "SystemExit: bye", "odd.py:"),
-    ),
-    "NoSpace": (
-        {"observation_space": None},
-        ("observation_space", "None", "gymnasium"),
-    ),
+    "Leaves": ("step … SystemExit: bye … odd.py:", give(lambda *_: sys.exit("bye"))),
+    "NoSpace": ("observation_space … None … gymnasium", {"observation_space": None}),
     "Words": (
-        see(
-            lambda at: {"at": np.array([float(at)]), "goal": "go"},
-            Dict({"at": box(1), "goal": Text(9)}),
-        ),
-        ("observations", "Text", "filter_keys: [at]"),
+        "observations … Text … filter_keys: [at]",
+        see(lambda at: {"at": cell(at), "goal": "go"}, WORDS),
     ),
     "Continuous": (
+        "actions … Box … {name: DiscretizeAction, bins: 5}",
         {"action_space": box(1, low=-1.0, high=1.0)},
-        ("actions", "Box", "{name: DiscretizeAction, bins: 5}"),
     ),
     "SeveralActions": (
+        "actions … MultiDiscrete … Discrete",
         {"action_space": MultiDiscrete([2, 2])},
-        ("actions", "MultiDiscrete", "Discrete"),
     ),
     "Unseeded": (
-        see(lambda at: np.array([at + np.random.default_rng().random()])),
-        ("reset", "episode 1", "reset(seed=…)"),
+        "reset … episode 1 … reset(seed=…)",
+        see(lambda at: cell(at + np.random.default_rng().random())),
     ),
-    "LateDice": ({"step": _late_dice}, ("step 71", "episode 1", "reset(seed=…)")),
-    "OutlivesAll": (
-        {
-            **first(lambda self, seed: COUNTS.update(episodes=1)),
-            **see(lambda at: np.array([float(at + COUNTS["episodes"])])),
-        },
-        ("reset", "episode 1", "outlives a reset"),
-    ),
-    "Shared": (see(_shared), ("differs", "expected", "share")),
+    "LateDice": ("step 71 … episode 1 … reset(seed=…)", {"step": late_dice}),
+    "OutlivesAll": ("reset … episode 1 … outlives a reset", LATER),
+    "Shared": ("differs … expected … share", see(shared)),
     "Clock": (
-        see(lambda at: np.array([at + time.perf_counter()])),
-        ("reset", "episode 1", "same reset and actions"),
+        "reset … episode 1 … same reset and actions",
+        see(lambda at: cell(at + time.perf_counter())),
     ),
 }
 
@@ -351,7 +300,7 @@ class FailsLate(Walk):
         return seen, reward, ended, False, {}
 
 
-ODD = SAME | {name: changes for name, (changes, _) in (VECTORS | REJECTED).items()}
+ODD = SAME | {name: changes for name, (_, changes) in (VECTORS | REJECTED).items()}
 CLASSES += [FailsLate, *(type(name, (Walk,), changes) for name, changes in ODD.items())]
 for cls in CLASSES:
     steps = 90 if cls.__name__ == "LateDice" else 12

@@ -1,4 +1,4 @@
-"""Our environments behind Gymnasium's interface: the same episodes, and its checks."""
+"""Our environments behind Gymnasium's interenv: the same episodes, and its checks."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ LINEAR = [
     {"task": t, "preset": p}
     for t, p in product(("lq", "target"), ("paper", "released"))
 ]
-FACES = [
+TASKS = [
     *(("CarOnHill", {"mass": mass}) for mass in (0.01, 0.8, 1.2)),
     *(("Maze", {"preset": preset, "height": 0.5}) for preset in PRESETS),
     *(("LinearSystem", constants) for constants in LINEAR),
 ]
-everything = pytest.mark.parametrize(("name", "constants"), FACES, ids=str)
+everything = pytest.mark.parametrize(("name", "constants"), TASKS, ids=str)
 
 
 def make(name: str, **options) -> gymnasium.Env:
@@ -65,16 +65,16 @@ def test_the_import_is_light_and_the_id_may_name_the_module():
 
 @everything
 def test_an_episode_is_the_pure_environments(name, constants):
-    face = make(name, **constants)
+    env = make(name, **constants)
     ours = env_class(REGISTERED[name][0])(**constants)
-    state, info = face.reset(seed=7)
-    luck, choices = np.random.default_rng(7), np.random.default_rng(1)
-    expected = ours.initial(luck.random(ours.initial_noise))
+    state, info = env.reset(seed=7)
+    rng, choices = np.random.default_rng(7), np.random.default_rng(1)
+    expected = ours.initial(rng.random(ours.initial_noise))
     assert info == {} and state.tolist() == expected.tolist()
     for t in range(ours.horizon):
         action = int(choices.integers(ours.n_actions))
-        state, reward, terminated, truncated, info = face.step(action)
-        noise = luck.random(ours.step_noise)
+        state, reward, terminated, truncated, info = env.step(action)
+        noise = rng.random(ours.step_noise)
         expected, r, absorbing = ours.step(expected, np.int64(action), noise)
         assert state.tolist() == expected.tolist()
         assert (reward, terminated) == (r, absorbing)
@@ -136,11 +136,11 @@ def test_a_car_at_its_fastest_stays_in_the_box():
 
 
 def test_a_seed_reproduces_an_episode_and_another_does_not():
-    face = make("LinearSystem")
+    env = make("LinearSystem")
 
     def episode(seed):
-        first, _ = face.reset(seed=seed)
-        return np.stack([first] + [face.step(0)[0] for _ in range(40)]).tolist()
+        first, _ = env.reset(seed=seed)
+        return np.stack([first] + [env.step(0)[0] for _ in range(40)]).tolist()
 
     assert episode(1) == episode(1) != episode(2)
 
@@ -160,22 +160,22 @@ def test_what_cannot_be_is_refused_with_the_key():
         GymEnv("maze", render_mode="ansi")
     with pytest.raises(TypeError, match="mass"):
         GymEnv(CarOnHill(), mass=1.0)
-    face = make("Maze")
-    face.reset(seed=0)
+    env = make("Maze")
+    env.reset(seed=0)
     for action in (-1, 4, 0.5):
         with pytest.raises(ValueError, match="no action"):
-            face.step(action)
+            env.step(action)
     assert make("CarOnHill", mass=np.linspace(1, 2, 3)[1]).unwrapped.task.mass == 1.5
 
 
 @everything
 def test_pictures_show_the_state(name, constants):
-    face = make(name, render_mode="rgb_array", **constants)
+    env = make(name, render_mode="rgb_array", **constants)
     pictures = []
-    face.reset(seed=0)
+    env.reset(seed=0)
     for _ in range(3):
-        pictures.append(face.render())
-        face.step(1)
+        pictures.append(env.render())
+        env.step(1)
     for picture in pictures:
         assert picture.shape == (400, 400, 3) and picture.dtype == np.uint8
     changed = [(a != b).sum() for a, b in pairwise(pictures)]
@@ -217,17 +217,17 @@ class Walk:
         return after, -abs(after[..., 0]), abs(after[..., 0]) > 5
 
 
-def test_an_environment_of_ones_own_gets_a_face():
-    face = GymEnv(Walk(), render_mode="rgb_array")
+def test_an_environment_of_ones_own_is_wrapped():
+    env = GymEnv(Walk(), render_mode="rgb_array")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(face, skip_render_check=True)
-    first, _ = face.reset(seed=1)
-    before = face.render()
-    second = face.step(1)[0]
-    luck = np.random.default_rng(1)
-    assert first == luck.random(1) and second == first + 1.0 + luck.random(1)
-    assert (face.render() != before).any()
+        check_env(env, skip_render_check=True)
+    first, _ = env.reset(seed=1)
+    before = env.render()
+    second = env.step(1)[0]
+    rng = np.random.default_rng(1)
+    assert first == rng.random(1) and second == first + 1.0 + rng.random(1)
+    assert (env.render() != before).any()
     cut = gymnasium.wrappers.TimeLimit(GymEnv(Walk()), Walk().horizon)
     cut.reset(seed=0)
     assert [cut.step(t % 2)[3] for t in range(10)] == [False] * 9 + [True]
