@@ -36,9 +36,14 @@ class GymEnv(gymnasium.Env):
     def __init__(
         self, env: Env | str, render_mode: str | None = None, **constants: Any
     ) -> None:
-        self.task, self.render_mode = _task(env, constants), _mode(render_mode)
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ConfigError("render_mode", render_mode, "must be rgb_array or None")
+        self.task, self.render_mode = _task(env, constants), render_mode
         self.metadata = self.metadata | {"render_fps": frames_per_second(self.task)}
-        self.observation_space = _observations(self.task)
+        everything = np.array([[-np.inf], [np.inf]]).repeat(self.task.state_dim, 1)
+        bounds = getattr(self.task, "bounds", everything)
+        low, high = np.clip(bounds, -UNBOUNDED, UNBOUNDED)
+        self.observation_space = Box(low, high, dtype=np.float64)
         self.action_space = Discrete(self.task.n_actions)
         self._path: list[Floats] = []  # the episode's states
 
@@ -87,10 +92,10 @@ class GymVectorEnv(VectorEnv):
         render_mode: str | None = None,
         **constants: Any,
     ) -> None:
-        self.task, self.render_mode = _task(env, constants), _mode(render_mode)
-        self.num_envs = num_envs
-        self.single_observation_space = _observations(self.task)
-        self.single_action_space = Discrete(self.task.n_actions)
+        one = GymEnv(env, render_mode, **constants)
+        self.task, self.render_mode, self.num_envs = one.task, render_mode, num_envs
+        self.single_observation_space = one.observation_space
+        self.single_action_space = one.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._limit = np.inf if max_episode_steps is None else max_episode_steps
@@ -162,16 +167,3 @@ def _task(env: Env | str, constants: dict[str, Any]) -> Env:
         if isinstance(value, np.generic):  # an entry of an array
             constants[key] = value.item()
     return construct("env", env_class(env), constants)
-
-
-def _mode(render_mode: str | None) -> str | None:
-    if render_mode not in (None, *GymEnv.metadata["render_modes"]):
-        raise ConfigError("render_mode", render_mode, "must be rgb_array or None")
-    return render_mode
-
-
-def _observations(task: Env) -> Box:
-    """The box of the states: the task's `bounds`, else all float32 numbers."""
-    everything = np.array([[-np.inf], [np.inf]]).repeat(task.state_dim, 1)
-    low, high = np.clip(getattr(task, "bounds", everything), -UNBOUNDED, UNBOUNDED)
-    return Box(low, high, dtype=np.float64)

@@ -27,7 +27,7 @@ def changed(change):
 
 
 DICE, BUFFER = iter(range(1000)), {}
-#: What is changed, and what the message has to say.
+#: The change, and words of the message.
 WRONG = {
     "other states": ({"state_dim": 2}, r"initial: states have shape \(16, 4, 1\)"),
     "no number": ({"initial_noise": None}, "initial_noise is None"),
