@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,9 @@ class Env(Protocol):
     actions: ClassVar[NDArray[np.float64]]  # (A, k) what each action does, as a vector
     gamma: float  # discount factor
     horizon: int  # steps after which an episode is cut (not absorbing)
+
+    def __hash__(self) -> int:
+        """Equal constants have equal hashes."""
 
     def initial(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
         """Start states (..., d) from noise (..., initial_noise)."""
@@ -159,7 +162,7 @@ class PureLanes:
         """Nothing is held."""
 
 
-def is_simulated(env: Env) -> bool:
+def is_simulated(env: Env) -> TypeGuard[SimulatedEnv]:
     """Whether `env` is a SimulatedEnv."""
     return hasattr(env, "lanes")
 
@@ -177,6 +180,6 @@ def check_episodes(gamma: float, horizon: int) -> None:
         raise ConfigError("env.horizon", horizon, "must be at least 1 step")
 
 
-def is_finite(env: Env) -> bool:
+def is_finite(env: Env) -> TypeGuard[FiniteEnv]:
     """Whether `env` is a FiniteEnv whose Q can be tabulated."""
     return getattr(env, "finite", False) and env.step_noise == 0

@@ -160,7 +160,7 @@ def _train(
         clock.note()
         # Rows are many small values, packed at once.
         rest = vars(session) | {"rows": json.dumps(session.rows)}
-        content = {"past": course.past, "session": rest, "kept": probe.kept}
+        content = {"past": course.state, "session": rest, "kept": probe.kept}
         _check_locks(plan, held)
         checkpoints.save(plan, seeds, share, content, course.given)
 

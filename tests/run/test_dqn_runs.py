@@ -101,7 +101,7 @@ def test_evaluating_twice_as_often_leaves_training_unchanged(tmp_path):
         often = f"algorithm.evaluate_every={every}"
         p = run(tmp_path / str(every), *LINEAR, "variant=SBC", often, "tag=x")
         *_, last = learn(p.stages, SeedBatch((0, 1), np.zeros((1, 4))))
-        ends.append(last.learned.residual.online.flat.numpy().copy())
+        ends.append(last.result.residual.online.flat.numpy().copy())
         assert len(rows(p, 0)) > 6
     assert np.array_equal(*ends)
     a, b = (
