@@ -104,7 +104,11 @@ class FQI:
                 y = residual_target(
                     reward[s], d.absorbing, q[d.next_state], base_sa, env.gamma
                 )
-                problems |= self._problems(stage, batch, k, s, d, y)
+                for a, part in enumerate(d.by_action):
+                    path = () if self.fixed_trees else (stage.number, k, a)
+                    fitted_to = (part.x, y[part.rows], part.multiplicity, part.queries)
+                    if len(part.rows):  # an action that was never tried has no model
+                        problems[s, a] = Problem(*fitted_to, batch.seeds[s], path)
             keep = not is_finite(env)  # a table is not queried between its points
             fits, lost = fit_each(self.regressor, problems, keep, batch.threads)
             failed = lost | failed
@@ -155,29 +159,3 @@ class FQI:
             data *= n
             failed = {s: why for s in range(n) for why in failed.values()}
         return FQIState(0, data, None, failed)
-
-    def _problems(
-        self,
-        stage: Stage,
-        batch: SeedBatch,
-        k: int,
-        s: int,
-        d: Dataset,
-        y: Floats,
-    ) -> dict[tuple[int, int], Problem]:
-        """Iteration k's regressions of seed index s to y (n,), by (seed, action).
-
-        An action that was never tried has none.
-        """
-        return {
-            (s, a): Problem(
-                part.x,
-                y[part.rows],
-                part.multiplicity,
-                part.queries,
-                batch.seeds[s],
-                () if self.fixed_trees else (stage.number, k, a),
-            )
-            for a, part in enumerate(d.by_action)
-            if len(part.rows)
-        }

@@ -6,6 +6,7 @@ import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,18 +47,14 @@ class Episodes:
         last = np.maximum(self.length - 1, 0)[..., None]
         ended = np.take_along_axis(self.absorbing, last, -1)[..., 0]
         reward = np.take_along_axis(self.reward, last, -1)[..., 0]
-        match rule:
-            case "absorbed":
-                return ended
-            case "survived":
-                return ~ended
-            case "rewarded":
-                return ended & (reward > 0.0)
-            case "threshold":
-                return self.reward.sum(-1) >= threshold
-            case "info" if self.reported is not None:
-                return self.reported
-        return ended & (reward >= 0.0)
+        outcomes: dict[str, Any] = {
+            "absorbed": ended,
+            "survived": ~ended,
+            "rewarded": ended & (reward > 0.0),
+            "threshold": self.reward.sum(-1) >= threshold,
+            "info": self.reported,
+        }
+        return outcomes.get(rule, ended & (reward >= 0.0))
 
 
 def draws(

@@ -14,7 +14,7 @@ from bcrl.evaluation import metrics
 from bcrl.evaluation.oracle import available, cache, maze, oracles, reference
 from bcrl.evaluation.oracle import car_on_hill as oracle
 from bcrl.evaluation.oracle.__main__ import main
-from bcrl.evaluation.oracle.cover import cover, image_boxes
+from bcrl.evaluation.oracle.car_on_hill import Search, cover, image_boxes
 from tests.toys import Corridor
 
 MASSES = pytest.mark.parametrize("mass", [0.8, 1.0, 1.2])
@@ -69,8 +69,8 @@ def test_search_agrees_with_plain_search_and_needs_no_particular_cover(mass):
         plain = plain_search(env, states[s], a, depth) if s % 3 == 0 else 0
         assert plain in (0, steps[s, a])
         assert plain or s % 3 or abs(steps[s, a]) > depth
-    coarse = oracle.search(env, states, cover(mass, 200), oracle.BUDGET)
-    np.testing.assert_array_equal(coarse, steps)
+    coarse = Search(env, *cover(mass, 200), oracle.BUDGET)
+    np.testing.assert_array_equal(coarse.signed_steps(states), steps)
     if mass == 1.2:
         assert steps.max() == 26
         for s, a in np.argwhere((steps >= 14) & (steps <= 16))[:3]:
@@ -89,7 +89,8 @@ def test_search_agrees_with_the_published_table():
 
 def test_a_car_too_heavy_to_leave_the_valley_stays_there_forever():
     valley = np.array([[-0.5, 0.0]])
-    steps = oracle.search(CarOnHill(mass=5.0), valley, cover(5.0, 500), oracle.BUDGET)
+    search = Search(CarOnHill(mass=5.0), *cover(5.0, 500), oracle.BUDGET)
+    steps = search.signed_steps(valley)
     np.testing.assert_array_equal(steps, [[0, 0]])
     np.testing.assert_array_equal(oracle.values(steps, 0.95), [[0.0, 0.0]])
 

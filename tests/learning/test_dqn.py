@@ -96,22 +96,6 @@ def test_epsilon_by_the_step():
     assert plain.length == 10_500
 
 
-def test_epsilon_is_how_often_it_explores():
-    """Actions in the replay: uniform while random, then almost all the greedy one."""
-    run = trainer(replace(TINY, random_steps=300, steps=300, learning_starts=10_000))
-    best = []
-    for _ in range(600):
-        values = run.state.deep(run.state.env_state[:, None], 8)
-        best.append(int(values[0, 0].argmax()))
-        run.act()
-        run.end_step()
-    action = run.state.replay.rows[0, :600, -1].numpy().astype(int)
-    same = action == np.array(best)
-    assert same[:300].mean() == pytest.approx(1 / 8, abs=0.06)
-    assert same[300:].mean() == pytest.approx(0.9 + 0.1 / 8, abs=0.05)
-    assert np.bincount(action[:300], minlength=8).min() > 20
-
-
 @pytest.mark.parametrize("random_steps", [0, 500])
 def test_the_first_gradient_step_is_that_of_the_501st_transition(random_steps):
     settings = replace(TINY, learning_starts=500, random_steps=random_steps)
@@ -248,14 +232,6 @@ def test_evaluating_changes_no_training(name, priors):
             assert a[0][column] == b[0][column]
 
 
-def test_threads_change_no_bit():
-    settings, found = replace(TINY, hidden=(64, 64)), []
-    for threads in (1, 2):
-        with threadpool_limits(threads):
-            found.append(weights(last(learn(settings, seeds=(0, 1)))))
-    assert torch.equal(*found)
-
-
 def test_an_absurd_learning_rate_fails_its_seeds_by_name():
     absurd = replace(TINY, learning_rate=1e30, random_steps=0, steps=15)
     with np.errstate(all="ignore"):
@@ -351,26 +327,3 @@ def test_the_recorded_loss_is_torchs_mean_since_the_last_snapshot(every):
             losses = [[], []]
     assert sides == {True, False}
     assert np.isnan(run.snapshot().loss).all()
-
-
-def test_transitions_are_the_environments_and_discounts_its_gamma():
-    settings = replace(TINY, random_steps=200, steps=1, learning_starts=1000)
-    env = Corridor(horizon=7)
-    run = trainer(settings, env=env, seeds=(0, 1))
-    for _ in range(200):
-        run.act()
-        run.end_step()
-    for s in range(2):
-        rows = run.state.replay.rows[s, :200].double().numpy()
-        after, reward, absorbing = env.step(rows[:, :1], rows[:, -1].astype(int))
-        assert np.array_equal(rows[:, 1:2], after)
-        assert np.allclose(rows[:, -3], reward)
-        assert np.allclose(rows[:, -2], np.where(absorbing, 0.0, 0.9))
-        steps = 0
-        for i in range(199):
-            steps += 1
-            if absorbing[i] or steps == 7:
-                steps = 0
-            else:
-                assert rows[i + 1, 0] == rows[i, 1]
-        assert absorbing.any()

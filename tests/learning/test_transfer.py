@@ -10,6 +10,7 @@ import torch
 from bcrl.common.seeding import stream
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.errors import ConfigError
+from bcrl.evaluation.oracle.maze import optimal_q
 from bcrl.learning.bellman import precompute_target, residual_target, shaping
 from bcrl.learning.dqn import BLOCK, CHOICES, DQN, DQNTrainer
 from bcrl.learning.policies import combined_actions
@@ -202,21 +203,6 @@ def test_the_residual_policys_table_is_a_brute_force_searchs():
         assert table[prior, own] == by_brute_force(actions, prior, own)
 
 
-@pytest.mark.parametrize(
-    ("prior", "own", "done"),
-    [
-        ((1, 0), (0, 1), (1, 1)),
-        ((1, 0), (-1, 0), (-1, 0)),  # they cancel
-        ((1, 0), (-1, 1), (0, 1)),  # at 67.5°, between (0, 1) and (1, 1)
-        ((-1, 1), (1, 0), (1, 1)),  # the same sum, the other own action
-    ],
-)
-def test_combined_actions_by_hand(prior, own, done):
-    units = [np.array(v) / math.hypot(*v) for v in (prior, own, done)]
-    index = [int(np.abs(TARGET.actions - v).sum(1).argmin()) for v in units]
-    assert combined_actions(TARGET.actions)[index[0], index[1]] == index[2]
-
-
 @pytest.mark.parametrize("epsilon", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("nu", [0.0, 0.998, 1.0])
 @pytest.mark.parametrize("step", [0, 700])
@@ -233,16 +219,6 @@ def test_the_prior_acts_with_probability_nu_to_the_step(step, nu, epsilon):
     assert np.array_equal(done[0], np.where(follow, 5, free))
     assert np.array_equal(own, done)
     assert follow.mean() == pytest.approx(nu**step, abs=0.03)
-
-
-def test_policy_reuse_in_a_run():
-    """ν = 1: the prior's greedy action is executed and stored in every step."""
-    settings = replace(SMALL, random_steps=20, epsilon=0.5)
-    run = run_of(StageInit(prior=Known(4), behavior=PolicyReuse(1.0)), settings)
-    for step in range(40):
-        run.act()
-        run.end_step()
-        assert stored(run, step)["action"] == 4
 
 
 def test_the_residual_policy_in_a_run():
@@ -392,22 +368,14 @@ def test_a_boosted_stage_starts_with_new_networks_on_a_frozen_sum():
 # --- shaping's invariance (Ng et al. 1999) ---
 
 
-def value_iteration(index, reward, absorbing, gamma):
-    q = np.zeros(reward.shape)
-    for _ in range(600):
-        after = np.where(absorbing, 0.0, q.max(1)[index])
-        q = reward + gamma * after
-    return q
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_shaping_shifts_q_by_minus_v_and_keeps_the_greedy_policy(seed):
     env = Corridor(prize=2.0)
     index, reward, absorbing = transition_tables(env)
     v = np.random.default_rng(seed).standard_normal(6) * 5.0
     extra = shaping(np.repeat(v[:, None], 2, 1), v[index], absorbing, env.gamma, True)
-    plain = value_iteration(index, reward, absorbing, env.gamma)
-    shaped = value_iteration(index, reward + extra, absorbing, env.gamma)
+    plain = optimal_q(index, reward, absorbing, env.gamma)
+    shaped = optimal_q(index, reward + extra, absorbing, env.gamma)
     assert np.allclose(shaped, plain - v[:, None], atol=1e-9)
     assert np.array_equal(shaped.argmax(1), plain.argmax(1))
     tables = (Table([t], env) for t in (shaped, np.repeat(v[:, None], 2, 1)))
@@ -419,9 +387,9 @@ def test_shaping_that_is_not_zero_at_the_goal_may_change_the_policy():
     index, reward, absorbing = transition_tables(env)
     v = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -20.0])
     extra = shaping(np.repeat(v[:, None], 2, 1), v[index], absorbing, env.gamma, False)
-    shaped = value_iteration(index, reward + extra, absorbing, env.gamma)
+    shaped = optimal_q(index, reward + extra, absorbing, env.gamma)
     assert shaped[4].argmax() == 0  # away from the goal
-    assert value_iteration(index, reward, absorbing, env.gamma)[4].argmax() == 1
+    assert optimal_q(index, reward, absorbing, env.gamma)[4].argmax() == 1
 
 
 # --- queries of frozen Q-functions ---

@@ -11,17 +11,16 @@ path found is one that `CarOnHill` drives.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.envs import car_on_hill as hill
-from bcrl.envs.car_on_hill import CarOnHill
+from bcrl.envs.car_on_hill import MAX_POSITION, MAX_SPEED, CarOnHill
 from bcrl.errors import BcrlError
 from bcrl.evaluation.oracle import Reference, cache
-from bcrl.evaluation.oracle import cover as covers
-from bcrl.evaluation.oracle.cover import FAR, Cover, cover
 from bcrl.learning import Booleans, Floats, Integers
 
 ENV = CarOnHill
@@ -29,10 +28,12 @@ ENV = CarOnHill
 COVERS = (500, 2000)
 BUDGET = 20_000_000  # steps driven with one cover: about 20 s and 1 GiB
 LONGEST = 2000  # steps after which a path counts as unresolved
-
-
-class _TooLong(Exception):
-    """The budget is spent."""
+#: Box margin beyond the corners' images, in cells. A cell's image bends away from its
+#: corners' hull by less than a third of a cell: where paths cross p = 0 the flow's
+#: gradient jumps by up to |v| = 3 /s, elsewhere the flow is smooth.
+MARGIN = 0.5
+FAR = 32767  # bound of a cell from which the goal is out of reach
+LIMITS = np.array([MAX_POSITION, MAX_SPEED])
 
 
 def signed_steps(env: CarOnHill) -> NDArray[np.int64]:
@@ -44,13 +45,22 @@ def signed_steps(env: CarOnHill) -> NDArray[np.int64]:
     (`bcrl.evaluation.oracle.cache`). Raises BcrlError for a mass that takes too long.
     Source: Klink et al. (2022), C.1; Ernst, Geurts & Wehenkel (2005).
     """
-    states = env.evaluation_states()
-    sources = [Path(str(module.__file__)) for module in (hill, covers)]
-    return cache.cached(
-        f"{env.name}_{float(env.mass).hex()}",
-        [*sources, Path(__file__)],
-        lambda: _solve(env, states),
+
+    def solve() -> NDArray[np.int64]:
+        for cells in COVERS:
+            try:
+                return Search(env, *cover(env.mass, cells), BUDGET).signed_steps(states)
+            except TooLong:
+                continue
+        why = "the search for Q* takes too long; choose a mass near 1 kg"
+        why += ", or leave q_error out of env.metrics"
+        raise BcrlError(f"env.mass={env.mass}: {why}")
+
+    states, sources = (
+        env.evaluation_states(),
+        [Path(str(hill.__file__)), Path(__file__)],
     )
+    return cache.cached(f"{env.name}_{float(env.mass).hex()}", sources, solve)
 
 
 def values(steps: NDArray[np.int64], gamma: float) -> Floats:
@@ -74,35 +84,81 @@ def table(env: CarOnHill) -> Iterator[str]:
             yield f"{p:.17g},{v:.17g},{force:g},{k},{q[row, action]:.17g}"
 
 
-def _solve(env: CarOnHill, states: Floats) -> NDArray[np.int64]:
-    for cells in COVERS:
-        steps = search(env, states, cover(env.mass, cells), BUDGET)
-        if steps is not None:
-            return steps
-    why = "the search for Q* takes too long; choose a mass near 1 kg"
-    raise BcrlError(f"env.mass={env.mass}: {why}, or leave q_error out of env.metrics")
+def cover(mass: float, cells: int) -> tuple[NDArray[np.int64], Booleans]:
+    """`bound` and `forever` of cells × cells cells, position-major.
+
+    `bound`: at least so many steps to the goal, `FAR` where it is out of reach.
+    `forever`: whether every state in the cell can avoid absorption forever.
+    """
+    low, high = image_boxes(mass, cells)
+    slow = (high[..., 1] >= -MAX_SPEED) & (low[..., 1] <= MAX_SPEED)
+    goal = slow & (high[..., 0] > MAX_POSITION)
+    alive = slow & (high[..., 0] >= -MAX_POSITION) & (low[..., 0] <= MAX_POSITION)
+    safe = ((low >= -LIMITS) & (high <= LIMITS)).all(-1)
+    first, last = _cell(low, cells), _cell(high, cells) + 1
+    # A cell is one step further from the goal than the nearest cell it may reach.
+    bound, steps = np.where(goal.any(0), 1, FAR), 1
+    while (bound == steps).any():
+        reaches = alive & (_count(bound <= steps, first, last) > 0)
+        steps += 1
+        bound[reaches.any(0) & (bound == FAR)] = steps
+    # Drop cells until the box of each one left has an action that stays among them.
+    area, forever = (last - first).prod(-1), np.ones((cells, cells), bool)
+    while True:
+        stays = (safe & (_count(forever, first, last) == area)).any(0) & forever
+        if (stays == forever).all():
+            return bound, forever
+        forever = stays
 
 
-def search(
-    env: CarOnHill, states: Floats, known: Cover, budget: int
-) -> NDArray[np.int64] | None:
-    """Signed steps (n, 2) of states (n, 2), or None beyond `budget` steps driven."""
-    try:
-        return _Search(env, known, budget).signed_steps(states)
-    except _TooLong:
-        return None
+def image_boxes(mass: float, cells: int) -> tuple[Floats, Floats]:
+    """Lower and upper corners of boxes around each cell's image, (2, cells, cells, 2).
+
+    The leading axis is the action.
+    """
+    axes = [np.linspace(-limit, limit, cells + 1) for limit in LIMITS]
+    corners = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    env, margin = CarOnHill(mass=mass), MARGIN * 2.0 * LIMITS / cells
+    low, high = np.empty((2, 2, cells, cells, 2))
+    for action in (0, 1):
+        image, _, _ = env.step(corners, np.full(corners.shape[:2], action))
+        four = image[:-1, :-1], image[1:, :-1], image[:-1, 1:], image[1:, 1:]
+        low[action] = np.minimum.reduce(four) - margin
+        high[action] = np.maximum.reduce(four) + margin
+    return low, high
 
 
-class _Search:
+def _cell(state: Floats, cells: int) -> NDArray[np.int64]:
+    """Row and column (..., 2) of the cell of, or nearest to, states (..., 2)."""
+    scaled = np.nan_to_num((state / LIMITS + 1.0) * (cells / 2))
+    return np.clip(scaled, 0, cells - 1).astype(np.int64)
+
+
+def _count(marked: Booleans, low: NDArray, high: NDArray) -> NDArray[np.int64]:
+    """Marked cells in boxes of cells, from `low` (..., 2) to before `high`."""
+    total = np.pad(marked.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    (i, j), (k, m) = np.moveaxis(low, -1, 0), np.moveaxis(high, -1, 0)
+    return total[k, m] - total[i, m] - total[k, j] + total[i, j]
+
+
+class TooLong(Exception):
+    """The search has spent its budget."""
+
+
+@dataclass
+class Search:
     """Drives paths layer by layer, all paths of the same length together."""
 
-    def __init__(self, env: CarOnHill, known: Cover, budget: int) -> None:
-        self.env, self.known, self.budget = env, known, budget
+    env: CarOnHill
+    bound: NDArray[np.int64]  # of each cell, see `cover`
+    forever: Booleans  # of each cell
+    budget: int  # steps that may still be driven
 
     def signed_steps(self, states: Floats) -> NDArray[np.int64]:
+        """Signed steps (n, 2) of states (n, 2); TooLong beyond the budget."""
         start, _, reward, absorbing = self._branch(states, np.arange(len(states)))
         steps = reward.astype(np.int64)  # ±1 where the first step decides
-        limit = self.known.bound[self.known.cell(start)]
+        limit = self._of(self.bound, start)
         waiting = np.flatnonzero(~absorbing & (limit < FAR))
         never = np.flatnonzero(~absorbing & (limit == FAR))
         # Iterative deepening from the bound: the first limit that suffices is least.
@@ -132,7 +188,7 @@ class _Search:
             arrived[pair[reward > 0.0]] = True
             going = ~(absorbing | arrived[pair])
             state, pair = state[going], pair[going]
-            bound = self.known.bound[self.known.cell(state)]
+            bound = self._of(self.bound, state)
             late = depth + bound > limit[pair]
             cut[pair[late & (bound < FAR)]] = True
             state, pair = state[~late], pair[~late]
@@ -140,17 +196,16 @@ class _Search:
 
     def _survive(self, start: Floats, pairs: Integers) -> NDArray[np.int64]:
         """The latest step at which a lost pair's −1 can come; 0: it can be avoided."""
-        latest = np.zeros(len(start), dtype=np.int64)
-        forever = np.zeros(len(start), dtype=np.bool_)
+        latest, forever = np.zeros(len(start), np.int64), np.zeros(len(start), bool)
         state, pair, depth = start[pairs], pairs, 0
         while True:
-            forever[pair[self.known.forever[self.known.cell(state)]]] = True
+            forever[pair[self._of(self.forever, state)]] = True
             state, pair = state[~forever[pair]], pair[~forever[pair]]
             if not pair.size:
                 return np.where(forever, 0, latest)
             depth += 1
             if depth > LONGEST:
-                raise _TooLong
+                raise TooLong
             latest[pair] = depth
             state, pair, _, absorbing = self._branch(state, pair)
             state, pair = state[~absorbing], pair[~absorbing]
@@ -161,8 +216,12 @@ class _Search:
         """Next states by both actions, the pairs they belong to, reward, absorbing."""
         self.budget -= 2 * pair.size
         if self.budget < 0:
-            raise _TooLong
+            raise TooLong
         n = self.env.n_actions
         after, reward, absorbing = self.env.step(state[:, None], np.arange(n))
         states = after.reshape(-1, self.env.state_dim)
         return states, np.repeat(pair, n), reward.ravel(), absorbing.ravel()
+
+    def _of(self, cells: NDArray, state: Floats) -> NDArray:
+        """The entries of `cells` for the cells of states (n, 2)."""
+        return cells[tuple(_cell(state, len(cells)).T)]
