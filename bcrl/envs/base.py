@@ -47,6 +47,9 @@ class Env(Protocol):
     gamma: float  # discount factor
     horizon: int  # steps after which an episode is cut (not absorbing)
 
+    def __hash__(self) -> int:
+        """Equal constants have equal hashes."""
+
     def initial(self, noise: Floats) -> Floats:
         """Start states (..., d) from noise (..., initial_noise)."""
 

@@ -192,7 +192,7 @@ class _Training:
         self._note_time()
         # Rows are many small values: one text takes less time and space.
         session = vars(self.progress) | {"rows": json.dumps(self.progress.rows)}
-        content = {"past": self.run.past, "session": session, "kept": self.probe.kept}
+        content = {"past": self.run.state, "session": session, "kept": self.probe.kept}
         self._check_locks()
         checkpoints.save_checkpoint(
             self.plan, self.seeds, share, content, self.run.given

@@ -114,7 +114,7 @@ def test_truncation_bootstraps_in_dqn():
     task = Gymnasium("tests/Counter-v0", kwargs={"stop": True})
     (stage,) = stages([task], learner)
     batch = SeedBatch((0,), task.evaluation_states())
-    replay = last(learner.learn(stage, StageInit(), batch)).state()["replay"]
+    replay = last(learner.learn(stage, StageInit(), batch)).state.replay
     kept = replay.rows[0, : replay.size]
     position, discount = kept[:, 0], kept[:, 2 + task.n_actions + 1]
     assert set(position.tolist()) == {0.0, 1.0, 2.0}  # anew after three steps
@@ -131,7 +131,7 @@ def test_q_mean_is_that_of_the_first_observations():
     for now in snapshots(learner.learn(stage, StageInit(), team)):
         resets = stream(seed, "evaluation", 1, now.count).random(n) * 2**31
         seen = np.stack([env.reset(seed=int(number))[0] for number in resets])
-        sizes, flat, at = (2, 9, 6, 3), now.learned.residual.online.flat[1], 0
+        sizes, flat, at = (2, 9, 6, 3), now.result.residual.online.flat[1], 0
         x = torch.from_numpy(seen)
         for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
             weights = flat[at : at + n_in * n_out].view(n_in, n_out)
@@ -150,7 +150,7 @@ def test_the_number_of_a_reset_is_rejected_as_a_state():
     batch = SeedBatch((0,), numbers)
     deep = last(snapshots(stage.learner.learn(stage, StageInit(), batch)))
     quadratic = Quadratic(np.eye(3)[None], np.zeros((1, 3)), np.ones((2, 1)))
-    for q in (deep.learned.q, quadratic):
+    for q in (deep.result.q, quadratic):
         for states in (numbers, list(numbers)):
             with pytest.raises(BcrlError, match=r"2 entries.* 1"):
                 q(states, 3)

@@ -287,7 +287,7 @@ class Silent:
 
 
 def test_a_learner_that_yields_no_last_snapshot_is_named():
-    early = Snapshot(None, 1, dict, False, None)
+    early = Snapshot(staged(Silent(), Corridor()), 0, None, None)
     for moments in ((), (early,)):
         stages = [staged(DQN(), Corridor()), staged(Silent(*moments), Corridor(), 2)]
         for some in (stages[1:], stages[1:] * 2):

@@ -195,7 +195,7 @@ def test_evaluating_dqn_twice_as_often_leaves_training_unchanged(tmp_path):
         often = f"algorithm.evaluate_every={every}"
         p = run(tmp_path / str(every), *LINEAR, "variant=SBC", often, "tag=x")
         *_, last = learn(p.stages, SeedBatch((0, 1), np.zeros((1, 4))))
-        ends.append(last.learned.residual.online.flat.numpy().copy())
+        ends.append(last.result.residual.online.flat.numpy().copy())
         # The loss is a mean over another span.
         kept = [{k: v for k, v in r.items() if k != "loss"} for r in rows(p, 0)]
         found.append({row["step"]: row for row in kept if row["stage"] == 2})
