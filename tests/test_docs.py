@@ -23,10 +23,13 @@ GENERATED = (ROOT / "docs" / "reference" / "config.md",)
 
 
 def commands(page: Path) -> list[str]:
-    """The `bcrl` lines of a page's shell blocks, whole and without comments."""
+    """The `bcrl` lines of a page's shell blocks, whole and without comments.
+
+    tests/test_own.py runs those with a folder of configs.
+    """
     blocks = re.findall(r"```sh\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
     lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
-    found = [line for line in lines if re.match(r"bcrl [^…<$]*$", line)]
+    found = [line for line in lines if re.match(r"bcrl (?!--config-dir)[^…<$]*$", line)]
     return [shlex.join(shlex.split(line, comments=True)) for line in found]
 
 
