@@ -79,6 +79,28 @@ def test_named_files_exist(page):
         assert (ROOT / name).exists(), name
 
 
+SHORT = {
+    **{"FQI": "fitted Q-iteration", "DQN": "deep Q-network", "LQ": "linear-quadratic"},
+    **{"LSPI": "least-squares policy iteration", "IQM": "interquartile mean"},
+    **{
+        "PPR": "policy reuse",
+        "RPL": "residual polic",
+        "ϱ": "residual",
+        "γ": "discount",
+    },
+}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_short_forms_are_spelled_out_on_each_page(page):
+    text = page.read_text("utf-8")
+    words = " ".join(text.split()).lower()
+    prose = re.sub(r"```.*?```|`[^`]*`", "", text, flags=re.S)
+    for short, meaning in SHORT.items():
+        if re.search(rf"(?<!\w){short}(?!\w)", prose):
+            assert meaning.lower() in words, short
+
+
 def test_every_page_is_in_the_navigation():
     navigation = (ROOT / "mkdocs.yml").read_text("utf-8").partition("\nnav:")[2]
     listed = set(re.findall(r": ([\w/.-]+\.md)$", navigation, re.M))
