@@ -1,4 +1,4 @@
-"""Environments of other packages learn by the commands of docs/howto/other_packages.md."""
+"""Environments of other packages learn by docs/howto/other_packages.md's commands."""
 
 import importlib.util
 import os
