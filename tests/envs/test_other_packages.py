@@ -1,4 +1,4 @@
-"""Environments of other packages learn by docs/howto/other_packages.md's commands."""
+"""Environments of other packages learn (docs/howto/other_packages.md)."""
 
 import importlib.util
 import os
