@@ -23,10 +23,13 @@ GENERATED = (ROOT / "docs" / "reference" / "config.md",)
 
 
 def commands(page: Path) -> list[str]:
-    """The `bcrl` lines of a page's shell blocks, whole and without comments."""
+    """The `bcrl` lines of a page's shell blocks, whole and without comments.
+
+    tests/test_own.py runs those with a folder of configs.
+    """
     blocks = re.findall(r"```sh\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
     lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
-    found = [line for line in lines if re.match(r"bcrl [^…<$]*$", line)]
+    found = [line for line in lines if re.match(r"bcrl (?!--config-dir)[^…<$]*$", line)]
     return [shlex.join(shlex.split(line, comments=True)) for line in found]
 
 
@@ -74,6 +77,28 @@ def test_named_files_exist(page):
         page.read_text("utf-8"),
     ):
         assert (ROOT / name).exists(), name
+
+
+SHORT = {
+    **{"FQI": "fitted Q-iteration", "DQN": "deep Q-network", "LQ": "linear-quadratic"},
+    **{"LSPI": "least-squares policy iteration", "IQM": "interquartile mean"},
+    **{
+        "PPR": "policy reuse",
+        "RPL": "residual polic",
+        "ϱ": "residual",
+        "γ": "discount",
+    },
+}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_short_forms_are_spelled_out_on_each_page(page):
+    text = page.read_text("utf-8")
+    words = " ".join(text.split()).lower()
+    prose = re.sub(r"```.*?```|`[^`]*`", "", text, flags=re.S)
+    for short, meaning in SHORT.items():
+        if re.search(rf"(?<!\w){short}(?!\w)", prose):
+            assert meaning.lower() in words, short
 
 
 def test_every_page_is_in_the_navigation():

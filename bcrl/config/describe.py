@@ -95,9 +95,8 @@ def describe(word: str) -> str:
         return "\n".join(f"{name}: {text.rstrip('.')}" for name, text in listed.items())
     from bcrl.config.hints import Hints  # composes a config, which takes a while
 
-    line = Hints(()).words(key, "") or ""
-    near = line.split(" ")[-1].partition("=")[0]
-    hint = f"did you mean {near}?" if near else "bcrl --describe lists all keys"
+    near = re.search(r"([\w./]+)=[^ ]*\?$", Hints(()).mean(key, ""))
+    hint = f"did you mean {near[1]}?" if near else "bcrl --describe lists all keys"
     raise BcrlError(f"--describe {key}: unknown key; {hint}")
 
 

@@ -66,6 +66,6 @@ def test_the_hill_is_measured_on_its_grid():
 
 
 @pytest.mark.parametrize("metrics", [["retrun"], [["return"]], ["q_error_start"]])
-def test_impossible_metrics_are_refused(metrics):
+def test_impossible_metrics_are_rejected(metrics):
     with pytest.raises(ConfigError, match=r"env.metrics"):
         check(metrics, CarOnHill())

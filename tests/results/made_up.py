@@ -59,7 +59,7 @@ def write_seeds(
     facts: Mapping[str, Any] | None = None,
 ) -> None:
     """All seeds of a plan, complete; `table` and `arrays` make a seed's."""
-    records.begin(plan)
+    records.make_run_directory(plan)
     for seed in plan.seeds:
         rows = table(seed).to_dict("records")
         records.write_seed(plan, seed, "complete", rows, arrays(seed), facts or {})

@@ -97,19 +97,19 @@ def test_steps_are_logged_and_gaps_left_out(tmp_path):
 
 def test_an_interrupted_run_logs_nothing_twice(tmp_path, monkeypatch):
     """Stopped after a while, resumed in a new event file."""
-    measure, train, seen, stops = job._measure, job.train, [], []
+    measure, train, seen, stops = job._Training.measure, job.train, [], []
 
-    def counted(probe, now, session, log):
-        measure(probe, now, session, log)
-        seen.append(now.count)
+    def counted(training, snapshot):
+        measure(training, snapshot)
+        seen.append(snapshot.count)
         if len(seen) == 7:
-            stops[0].ask()
+            stops[0].request()
 
     def stoppable(job, tick, stop):
         stops.append(stop)
         return train(job, tick, stop)
 
-    monkeypatch.setattr(job, "_measure", counted)
+    monkeypatch.setattr(job._Training, "measure", counted)
     monkeypatch.setattr(job, "train", stoppable)
     with pytest.raises(Interrupted):
         run(tmp_path, *BC, "logger=tensorboard")

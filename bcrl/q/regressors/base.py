@@ -153,7 +153,9 @@ def _reason(regressor: Regressor, what: str, error: Exception) -> str:
 class Threads(Protocol):
     """Whoever says how many threads predictions may take."""
 
-    threads: int
+    @property
+    def threads(self) -> int:
+        """The number of threads."""
 
 
 @storable
