@@ -45,10 +45,6 @@ class Slurm(SlurmLauncher):
 
     def __init__(self, seeds_per_job: int | None = None, **params: Any) -> None:
         super().__init__(**params)
-        count = 1 if seeds_per_job is None else seeds_per_job
-        if type(count) is not int or count < 1:
-            why = "must be a number of at least 1, or null"
-            raise ConfigError("hydra.launcher.seeds_per_job", seeds_per_job, why)
         self.seeds_per_job = seeds_per_job
         self.argv = sys.argv
 

@@ -71,6 +71,19 @@ def test_the_parts_of_seeds_are_all_of_them_once():
     assert [p.seeds for p in merged(whole)] == [(0, 1, 2, 3, 4)]
 
 
+@pytest.mark.slow
+def test_a_sweep_over_experiments_is_all_of_their_jobs():
+    found = plans("experiment=fig1,fig2,fig4", "scale=paper", multirun=True)
+    assert len(found) == 4 + 4 + 7
+    assert sum(len(p.seeds) for p in found) == 4 * 20 + 4 * 40 + 7 * 100  # all 940 runs
+
+
+@pytest.mark.parametrize("name", ["fig1,fig11", "interval(0,1)"])
+def test_an_unknown_experiment_is_rejected(name):
+    with pytest.raises(BcrlError, match="fig1"):
+        plans(f"experiment={name}", multirun=True)
+
+
 @pytest.mark.parametrize("part", ["0/2", "3/2", "1/4", "1", "a/b", "1/0", "-1/2"])
 def test_an_invalid_part_is_rejected(part):
     with pytest.raises(BcrlError, match=r"seeds\.part"):
