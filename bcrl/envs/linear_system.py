@@ -124,10 +124,11 @@ class LinearSystem:
 
     @cached_property
     def _dynamics(self) -> Floats:
-        """Gain, friction, drift and the walls' x, for compiled code; (5,)."""
+        """Gain, friction, drift, the walls' x and the start box, for compiled code."""
+        gain, friction, spread = self.constants
         free = self.task == "lq"
         rest = (0.0, -np.inf, np.inf) if free else (self.drift, *WALLS)
-        return np.array([*self.constants[:2], *rest])
+        return np.array([gain, friction, *rest, *spread])
 
     def initial(self, noise: Floats) -> Floats:
         """Start states (..., 4): the box around (−4, 0, 0, 0), for noise (..., 4)."""
@@ -141,8 +142,7 @@ class LinearSystem:
         """One step with any force (..., 2); the fresh start, if any, is in `noise`."""
         normal = ndtri(noise[..., :4])
         if self.task == "target":
-            fresh = self.initial(noise[..., 4:])
-            return _pathway(state, force, normal, fresh, self._dynamics)
+            return _pathway(state, force, normal, noise[..., 4:], self._dynamics)
         after, reward = _lq(state, force, normal, self._dynamics)
         return after, reward, np.zeros_like(reward, bool)
 
@@ -231,18 +231,19 @@ def _pathway(
     state: Any,
     force: Any,
     normal: Any,
-    fresh: Any,
+    uniform: Any,
     dynamics: Any,
     after: Any,
     reward: Any,
     arrived: Any,
 ) -> None:
-    """The target task's next state, reward and end; `fresh`: a fresh start."""
-    x, x_dot, y, y_dot = _moved(state, force, normal, dynamics)
-    if y > PATHWAY or y < -PATHWAY:
-        x, x_dot, y, y_dot = fresh[0], fresh[1], fresh[2], fresh[3]
-    after[0], after[1], after[2], after[3] = x, x_dot, y, y_dot
-    arrived[0] = x * x + y * y < _GOAL_RADIUS * _GOAL_RADIUS
+    """The target task's next state, reward and end; `uniform` gives a fresh start."""
+    after[0], after[1], after[2], after[3] = _moved(state, force, normal, dynamics)
+    if after[2] > PATHWAY or after[2] < -PATHWAY:
+        for i in range(4):  # as `initial`
+            after[i] = _START[i] + dynamics[5 + i] * (2.0 * uniform[i] - 1.0)
+    distance = after[0] * after[0] + after[2] * after[2]
+    arrived[0] = distance < _GOAL_RADIUS * _GOAL_RADIUS
     reward[0] = 0.0 if arrived[0] else -1.0
 
 
