@@ -20,7 +20,7 @@ SUBSTEPS = 6  # Runge-Kutta steps a force is held for; error below 1e-7
 MAX_POSITION = 1.0  # m
 MAX_SPEED = 3.0  # m/s
 GRID = 10  # evaluation states along each axis
-START = (-0.5, 0.0)  # m, m/s: at rest in the valley
+_START = (-0.5, 0.0)  # m, m/s: at rest in the valley
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class CarOnHill:
 
     def initial(self, noise: Floats) -> Floats:
         """The valley (−0.5, 0) for noise of shape (..., 0)."""
-        return np.broadcast_to(np.array(START), (*noise.shape[:-1], 2)).copy()
+        return np.broadcast_to(np.array(_START), (*noise.shape[:-1], 2)).copy()
 
     def step(self, state: Floats, action: Ints, noise: Floats | None = None) -> Step:
         """Hold a force for 0.1 s; IndexError for an action other than 0 and 1."""

@@ -28,8 +28,8 @@ LARGEST = float(np.finfo(np.float32).max)  # learners see float32
 RESOLUTION = 1e-7  # forests take values that differ by less for equal
 LEVELS = 10_000  # a component with more distinct values is fine enough
 
-LANES = (16, 4)  # leading axes of the states in a pure environment's trial
-STEPS = 200  # of each of these episodes
+_LANES = (16, 4)  # leading axes of the states in a pure environment's trial
+_STEPS = 200  # of each of these episodes
 #: Numbers that an environment needs, and the least value of each.
 _NUMBERS = {"n_actions": 1, "state_dim": 1, "horizon": 1, "gamma": 0}
 _NUMBERS |= {"initial_noise": 0, "step_noise": 0}
@@ -116,7 +116,7 @@ def check_pure_tasks(name: str, tasks: Sequence[Env]) -> None:
         traces.append(trial.trace)
     if getattr(tasks[-1], "verify", True):
         allowed_by = f"verify = False in the class {type(tasks[-1]).__name__}"
-        check_different(tasks, traces, int(np.prod(LANES)), allowed_by)
+        check_different(tasks, traces, int(np.prod(_LANES)), allowed_by)
 
 
 class _Trial:
@@ -131,11 +131,11 @@ class _Trial:
         """Call every method of the protocol; ConfigError for a broken contract."""
         self._check_constants()
         env, rng = self.env, np.random.default_rng(0)
-        noise = rng.random((*LANES, env.initial_noise))
-        (state,) = self._answers("initial", noise, gives={"states": LANES})
+        noise = rng.random((*_LANES, env.initial_noise))
+        (state,) = self._answers("initial", noise, gives={"states": _LANES})
         self._answers("evaluation_states", gives={"states": (None,)})
         self.states, self.trace = [state], [state.tobytes()]
-        for _ in range(min(env.horizon, STEPS)):
+        for _ in range(min(env.horizon, _STEPS)):
             lanes = state.shape[:-1]
             action = rng.integers(env.n_actions, size=lanes)
             noise = rng.random((*lanes, env.step_noise))

@@ -32,9 +32,9 @@ from bcrl.envs.simulators import (
 )
 from bcrl.errors import BcrlError, ConfigError, at_least
 
-TRIES = 5  # random episodes that are played in every task before any work,
-STEPS = 10_000  # with so many steps altogether
-SECONDS = 5.0  # and for so long
+_TRIES = 5  # random episodes that are played in every task before any work,
+_STEPS = 10_000  # with so many steps altogether
+_SECONDS = 5.0  # and for so long
 _KEPT = 4_000_000  # numbers of their observations, to see how fine they are
 _MOST_ACTIONS = 2**15 - 1  # kept as int16
 _RESCALE = (
@@ -198,7 +198,7 @@ class Gymnasium:
             note_resolution(key, seen.coarse, _RESCALE)
         if tasks[-1].verify:
             traces = [task.trial.trace for task in tasks]
-            check_different(tasks, traces, TRIES, "env.verify=false")
+            check_different(tasks, traces, _TRIES, "env.verify=false")
 
 
 @dataclass(frozen=True)
@@ -230,11 +230,11 @@ def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
     rewards: list[float] = []
     try:
         n_actions = _checked_actions(first)
-        simulators += [Simulator(recipe) for _ in range(TRIES - 1)]
-        steps = min(horizon, STEPS // TRIES)
-        actions = np.random.default_rng(0).integers(n_actions, size=(steps, TRIES)).T
+        simulators += [Simulator(recipe) for _ in range(_TRIES - 1)]
+        steps = min(horizon, _STEPS // _TRIES)
+        actions = np.random.default_rng(0).integers(n_actions, size=(steps, _TRIES)).T
         played = map(_episode, simulators, itertools.count(), actions.tolist())
-        deadline = time.monotonic() + SECONDS
+        deadline = time.monotonic() + _SECONDS
         for outcomes in itertools.zip_longest(*played):
             running = [outcome for outcome in outcomes if outcome]
             if len(seen) * first.state_dim < _KEPT:
@@ -290,7 +290,7 @@ def default_success(
 
 def _episode(simulator: Simulator, number: int, actions: list[int]) -> Iterator[tuple]:
     """Observation, reward, terminated, truncated after the reset and each step."""
-    yield simulator.reset(reset_seed((number + 0.5) / TRIES)), 0.0, False, False
+    yield simulator.reset(reset_seed((number + 0.5) / _TRIES)), 0.0, False, False
     for action in actions:
         state, reward, ended, cut, _ = simulator.step(action)
         yield state, reward, ended, cut

@@ -17,8 +17,8 @@ DT = 0.05  # s, Euler step
 NOISE = 1e-5  # standard deviation of the noise on each component of the derivative
 WALLS = (-5.0, 1.0)  # x of the two reflecting walls (target task)
 PATHWAY = 0.5  # |y| beyond which the target task starts anew
-GOAL_RADIUS = 0.2  # distance to the origin that counts as success
-START = np.array([-4.0, 0.0, 0.0, 0.0])
+_GOAL_RADIUS = 0.2  # distance to the origin that counts as success
+_START = np.array([-4.0, 0.0, 0.0, 0.0])
 STATE_COST = (3.0, 1.0, 3.0, 1.0)  # diagonal, LQ task
 ACTION_COST = 0.1  # per squared unit of force, LQ task
 DIAGONAL = np.sqrt(0.5)
@@ -37,7 +37,7 @@ class Constants(NamedTuple):
 
 
 #: preset → task → constants (paper, C.3; released code)
-PRESETS = {
+_PRESETS = {
     "released": {
         "lq": Constants(2.0, 0.1, (0.3, 0.3, 0.3, 0.3)),
         "target": Constants(2.0, 1.0, (1e-3, 0.1, 0.4, 0.1)),
@@ -60,7 +60,7 @@ class LinearSystem:
     | dynamics | x' = ẋ, ẋ' = −friction ẋ + gain F_x, same for y; noise N(0, 1e-5²) on each derivative; Euler steps of 0.05 s |
     | `task=lq` | reward −s'ᵀ diag(3, 1, 3, 1) s' − 0.1 ‖F‖²; horizon 100; never absorbing |
     | `task=target` | `drift` is added to x'; walls at x = −5 and x = 1 reflect (the drift may push x beyond by 0.02, where ẋ changes sign each step); a step that ends with \\|y\\| > 0.5 leads to a fresh start (not absorbing); reward 0 and absorbing if ‖(x, y)‖ < 0.2, else −1; horizon 150 |
-    | start | (−4, 0, 0, 0) plus a uniform draw from a box, see PRESETS |
+    | start | (−4, 0, 0, 0) plus a uniform draw from a box, see `constants` |
     | source | Klink et al. (2022), §6.3 and C.3; released code for dt, walls, γ, horizons |
 
     `preset=released` (default) has gain 2, friction 0.1 in the LQ task and 1.0 in the
@@ -83,7 +83,7 @@ class LinearSystem:
     positions: ClassVar[tuple[int, ...]] = (0, 2)
 
     def __post_init__(self) -> None:
-        for key, allowed in (("task", ("lq", "target")), ("preset", tuple(PRESETS))):
+        for key, allowed in (("task", ("lq", "target")), ("preset", tuple(_PRESETS))):
             value = getattr(self, key)
             if value not in allowed:
                 raise ConfigError(f"env.{key}", value, did_you_mean(value, allowed))
@@ -92,7 +92,7 @@ class LinearSystem:
     @property
     def constants(self) -> Constants:
         """Gain, friction and start box of this task in this preset."""
-        return PRESETS[self.preset][self.task]
+        return _PRESETS[self.preset][self.task]
 
     @property
     def bounds(self) -> Floats:
@@ -124,14 +124,15 @@ class LinearSystem:
 
     @cached_property
     def _dynamics(self) -> Floats:
-        """Gain, friction, drift and the walls' x, for compiled code; (5,)."""
+        """Gain, friction, drift, the walls' x and the start box, for compiled code."""
+        gain, friction, spread = self.constants
         free = self.task == "lq"
         rest = (0.0, -np.inf, np.inf) if free else (self.drift, *WALLS)
-        return np.array([*self.constants[:2], *rest])
+        return np.array([gain, friction, *rest, *spread])
 
     def initial(self, noise: Floats) -> Floats:
         """Start states (..., 4): the box around (−4, 0, 0, 0), for noise (..., 4)."""
-        return START + np.array(self.constants.spread) * (2.0 * noise - 1.0)
+        return _START + np.array(self.constants.spread) * (2.0 * noise - 1.0)
 
     def step(self, state: Floats, action: Ints, noise: Floats) -> Step:
         """One step with action (...), an index into `actions`."""
@@ -141,8 +142,7 @@ class LinearSystem:
         """One step with any force (..., 2); the fresh start, if any, is in `noise`."""
         normal = ndtri(noise[..., :4])
         if self.task == "target":
-            fresh = self.initial(noise[..., 4:])
-            return _pathway(state, force, normal, fresh, self._dynamics)
+            return _pathway(state, force, normal, noise[..., 4:], self._dynamics)
         after, reward = _lq(state, force, normal, self._dynamics)
         return after, reward, np.zeros_like(reward, bool)
 
@@ -155,9 +155,9 @@ class LinearSystem:
 
         The same in both tasks, so that FQI's curves are comparable between them.
         """
-        half = 0.5 * np.array(PRESETS[self.preset]["target"].spread)
+        half = 0.5 * np.array(_PRESETS[self.preset]["target"].spread)
         signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 4, indexing="ij"), -1)
-        return START + half * np.vstack([np.zeros((1, 4)), signs.reshape(-1, 4)])
+        return _START + half * np.vstack([np.zeros((1, 4)), signs.reshape(-1, 4)])
 
     def plane(self, side: int = 41, extent: float = 5.0) -> Floats:
         """The x–y plane [−extent, extent]² at zero velocity, x-major, (side², 4)."""
@@ -168,11 +168,11 @@ class LinearSystem:
 
     def scene(self) -> dict[str, Floats]:
         """What a figure needs to draw the task: forces, pathway, goal, start, drift."""
-        at, half = START[[0, 2]], np.array(self.constants.spread)[[0, 2]]
+        at, half = _START[[0, 2]], np.array(self.constants.spread)[[0, 2]]
         return {
             "actions": ACTIONS,
             "pathway": np.array([WALLS[0], -PATHWAY, WALLS[1], PATHWAY]),
-            "goal": np.array([0.0, 0.0, GOAL_RADIUS]),
+            "goal": np.array([0.0, 0.0, _GOAL_RADIUS]),
             "start": np.concatenate([at - half, at + half]),
             "drift": np.array([self.drift, 0.0]),
         }
@@ -231,18 +231,19 @@ def _pathway(
     state: Any,
     force: Any,
     normal: Any,
-    fresh: Any,
+    uniform: Any,
     dynamics: Any,
     after: Any,
     reward: Any,
     arrived: Any,
 ) -> None:
-    """The target task's next state, reward and end; `fresh`: a fresh start."""
-    x, x_dot, y, y_dot = _moved(state, force, normal, dynamics)
-    if y > PATHWAY or y < -PATHWAY:
-        x, x_dot, y, y_dot = fresh[0], fresh[1], fresh[2], fresh[3]
-    after[0], after[1], after[2], after[3] = x, x_dot, y, y_dot
-    arrived[0] = x * x + y * y < GOAL_RADIUS * GOAL_RADIUS
+    """The target task's next state, reward and end; `uniform` gives a fresh start."""
+    after[0], after[1], after[2], after[3] = _moved(state, force, normal, dynamics)
+    if after[2] > PATHWAY or after[2] < -PATHWAY:
+        for i in range(4):  # as `initial`
+            after[i] = _START[i] + dynamics[5 + i] * (2.0 * uniform[i] - 1.0)
+    distance = after[0] * after[0] + after[2] * after[2]
+    arrived[0] = distance < _GOAL_RADIUS * _GOAL_RADIUS
     reward[0] = 0.0 if arrived[0] else -1.0
 
 

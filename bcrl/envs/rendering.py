@@ -14,7 +14,7 @@ from bcrl.envs import Env
 from bcrl.envs.base import Floats
 from bcrl.envs.maze import GOAL_RADIUS
 
-SIZE = 400  # pixels of a picture's sides
+_SIZE = 400  # pixels of a picture's sides
 FINER = 2  # the drawing has so many times the pixels, for smooth edges
 FONT = ImageFont.load_default(15)
 
@@ -32,14 +32,14 @@ class Canvas:
     """
 
     def __init__(self, left: float, bottom: float, side: float, ground: str) -> None:
-        self.corner, self.scale = np.array([left, bottom]), SIZE * FINER / side
-        self._image = Image.new("RGB", (SIZE * FINER, SIZE * FINER), ground)
+        self.corner, self.scale = np.array([left, bottom]), _SIZE * FINER / side
+        self._image = Image.new("RGB", (_SIZE * FINER, _SIZE * FINER), ground)
         self._pen = ImageDraw.Draw(self._image)
         self._texts: list[tuple[tuple[int, int], str, str]] = []
 
     def _pixels(self, points: Any) -> list[tuple[float, float]]:
         x, y = ((np.asarray(points, float) - self.corner) * self.scale).T
-        return list(zip(x, SIZE * FINER - y, strict=True))
+        return list(zip(x, _SIZE * FINER - y, strict=True))
 
     def polygon(self, points: Any, fill: str) -> None:
         self._pen.polygon(self._pixels(points), fill)
@@ -71,7 +71,7 @@ class Canvas:
         self._texts.append(((x, y), words, anchor))
 
     def picture(self) -> NDArray[np.uint8]:
-        """The drawing, (SIZE, SIZE, 3)."""
+        """The drawing, (400, 400, 3)."""
         image = self._image.reduce(FINER)
         pen = ImageDraw.Draw(image)
         for at, words, anchor in self._texts:
@@ -82,7 +82,7 @@ class Canvas:
 def draw(
     env: Env, path: Floats, action: Any = None, caption: str = ""
 ) -> NDArray[np.uint8]:
-    """A picture (SIZE, SIZE, 3) of an environment after the states `path` (n, d).
+    """A picture (400, 400, 3) of an environment after the states `path` (n, d).
 
     The last state is the present one; `action`, a number or a force (k,), is applied
     in it. `caption` stands below the picture.
@@ -92,7 +92,7 @@ def draw(
         action = vectors[action]
     drawing = DRAWINGS.get(type(env).__module__, _bars)
     canvas = drawing(env, np.asarray(path, float), action)
-    canvas.text(12, SIZE - 10, caption, "ld")
+    canvas.text(12, _SIZE - 10, caption, "ld")
     return canvas.picture()
 
 
@@ -138,7 +138,7 @@ def _car_on_hill(env: Any, path: Floats, force: Any) -> Canvas:
     end = 0.8 * min(max(speed / 3.0, -1.0), 1.0)  # a gauge of the speed
     canvas.rectangle(-0.8, -0.645, 0.8, -0.595, PAPER)
     canvas.rectangle(min(0, end), -0.645, max(0, end), -0.595, BLUE)
-    canvas.text(SIZE // 2, 312, f"{speed:+.2f} m/s", "mm")
+    canvas.text(_SIZE // 2, 312, f"{speed:+.2f} m/s", "mm")
     canvas.text(12, 10, f"Car on the hill, {env.mass:g} kg")
     return canvas
 
@@ -206,9 +206,9 @@ def _bars(env: Any, path: Floats, force: Any) -> Canvas:
         end = value / (1.0 + abs(value)) if np.isfinite(value) else 0.0
         canvas.rectangle(-1.0, y - thick, 1.0, y + thick, PALE)
         canvas.rectangle(min(0, end), y - thick, max(0, end), y + thick, BLUE)
-        row = round((1.6 - y) / 3.2 * SIZE)
+        row = round((1.6 - y) / 3.2 * _SIZE)
         canvas.text(8, row, f"s{i}", "lm")
-        canvas.text(SIZE - 8, row, f"{value:.3g}", "rm")
+        canvas.text(_SIZE - 8, row, f"{value:.3g}", "rm")
     canvas.line([(0, -top), (0, top)], GREY, 1)
     canvas.text(12, 10, getattr(env, "name", type(env).__name__))
     return canvas

@@ -21,15 +21,15 @@ from bcrl.envs.base import Bools, Floats
 from bcrl.envs.checks import LARGEST, described
 from bcrl.errors import BcrlError
 
-SEEDS = 2**31  # resets take seeds below: every 32-bit generator accepts them
-SUCCESS_KEYS = ("is_success", "success")  # of info
+_SEEDS = 2**31  # resets take seeds below: every 32-bit generator accepts them
+_SUCCESS_KEYS = ("is_success", "success")  # of info
 #: Spaces whose members become a vector without loss.
 _PLAIN = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 #: Errors that end more than one simulator.
 _PASSING = (BcrlError, Interrupted, KeyboardInterrupt, GeneratorExit)
 
 #: Observation (d,), reward, terminated, truncated, and whether info reports success.
-Outcome = tuple[Floats, float, bool, bool, bool]
+_Outcome = tuple[Floats, float, bool, bool, bool]
 
 
 class BrokenSimulator(BcrlError):
@@ -86,7 +86,7 @@ class Simulator:
         self._used = True
         return first
 
-    def step(self, action: int) -> Outcome:
+    def step(self, action: int) -> _Outcome:
         """The outcome of one step with an action counted from 0."""
         answer = self._call("step", self.env.step, action + self._first_action)
         names = "observation, reward, terminated, truncated and info"
@@ -185,7 +185,7 @@ class Simulator:
             raise self.broken(
                 method, f"gave info {_shown(info)}", "a dict as last value"
             )
-        for key in SUCCESS_KEYS:
+        for key in _SUCCESS_KEYS:
             if key in info:
                 value = self._call(f'{method}\'s info["{key}"]', np.asarray, info[key])
                 if _is_boolean(value):
@@ -327,7 +327,7 @@ class SimulatedLanes:
 
 def reset_seed(number: float) -> int:
     """The seed of a reset for a number in [0, 1)."""
-    return int(number * SEEDS)
+    return int(number * _SEEDS)
 
 
 def is_plain(space: spaces.Space) -> bool:
