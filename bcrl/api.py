@@ -150,7 +150,7 @@ def run(
     seeds, metrics, target = _seeds(seeds), tuple(metrics), course[-1].env
     tasks = [*dict.fromkeys(s.env for s in course if s.env != target), target]
     if isinstance(course[-1].learner, FQI):
-        probes.check(metrics, target)
+        probes.check_metrics(metrics, target)
         probe = probes.Probe(seeds, tasks, metrics)
     else:
         probe = StepProbe(seeds, tasks)
