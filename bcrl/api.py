@@ -126,7 +126,7 @@ def run(
     tasks = [*dict.fromkeys(s.env for s in stages if s.env != target), target]
     probe: fqi_metrics.Probe | StepProbe
     if isinstance(stages[-1].learner, FQI):
-        fqi_metrics.check(metrics, target)
+        fqi_metrics.check_metrics(metrics, target)
         probe = fqi_metrics.Probe(seeds, tasks, metrics)
     else:
         probe = StepProbe(seeds, tasks)

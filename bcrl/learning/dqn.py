@@ -24,7 +24,7 @@ from bcrl.learning.stage import Pause, SeedBatch, Stage, StepSnapshot
 from bcrl.learning.transfer import PolicyReuse, ResidualPolicy, StageInit, StageResult
 from bcrl.q.networks.mlp import Adam, DeepQ, Networks, xavier
 
-BLOCK = 500  # steps whose uniforms are drawn at a time, from a stream of their own
+DRAW_BLOCK = 500  # steps per block; each block has its own random stream
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class DQNTrainer:
         """Every seed makes one environment step and stores the transition."""
         env, start, now = self.env, self.start, self.state
         u = self._draws()  # (S, CHOICES + step_noise + initial_noise)
-        noise, fresh = np.split(u[:, CHOICES:], [env.step_noise], axis=1)
+        noise = u[:, CHOICES : CHOICES + env.step_noise]
         residual = now.residual  # (S, A)
         if residual is None:
             residual = self._values(now.deep, now.env_state[:, None])[:, 0]
@@ -196,18 +196,19 @@ class DQNTrainer:
         now.steps_in_episode += 1
         over = absorbing | cut | (now.steps_in_episode == env.horizon)
         if over.any():
-            next_state = now.lanes.restart(over, env.initial(fresh), next_state)
+            fresh_noise = u[:, CHOICES + env.step_noise :]
+            next_state = now.lanes.restart(over, env.initial(fresh_noise), next_state)
             now.steps_in_episode[over] = 0
             next_frozen = self._frozen_at(next_state)
         now.env_state, self._frozen = next_state, next_frozen
 
     def _draws(self) -> Floats:
         """All uniforms of this step, (S, CHOICES + step_noise + initial_noise)."""
-        block, at = divmod(self.state.step, BLOCK)
+        block, at = divmod(self.state.step, DRAW_BLOCK)
         if block != self._block:
             env, number = self.env, self.stage.number
-            shape = (BLOCK, CHOICES + env.step_noise + env.initial_noise)
-            batches = (BLOCK, self.settings.batch_size)
+            shape = (DRAW_BLOCK, CHOICES + env.step_noise + env.initial_noise)
+            batches = (DRAW_BLOCK, self.settings.batch_size)
 
             def drawn(purpose: str, shape: tuple[int, int]) -> Floats:
                 rngs = (stream(s, purpose, number, block) for s in self.batch.seeds)
@@ -247,9 +248,9 @@ class DQNTrainer:
         """
         behavior, now = self.start.behavior, self.state
         greedy_on = residual + base if self.start.boost.greedy_on == "sum" else residual
-        random = u[..., 0] < epsilon
+        random, choice = u[..., 0] < epsilon, u[..., 1]
         own = np.where(
-            random, uniform(self.n_actions, u[..., 1]), greedy(greedy_on, u[..., 1])
+            random, uniform(self.n_actions, choice), greedy(greedy_on, choice)
         )
         if isinstance(behavior, PolicyReuse):
             follow = reuse & (u[..., 2] < behavior.nu**now.step)
@@ -263,9 +264,9 @@ class DQNTrainer:
         return own, self._combined[advised, own]
 
     def update(self) -> None:
-        """One gradient step of every seed on a batch of its own."""
+        """One gradient step per seed, each on a separate batch."""
         now, target_update = self.state, self.settings.target_update
-        at, since = now.step % BLOCK, now.deep.steps % target_update
+        at, since = now.step % DRAW_BLOCK, now.deep.steps % target_update
         # After a copy of the target (or a new block) the batches until the next one.
         batches = 1 if at and since else target_update - since
         indices = self._indices[at : at + batches]  # (T, S, B)

@@ -60,8 +60,9 @@ class Replay:
         action: Integers,  # (S,)
     ) -> None:
         """Store one transition of every seed."""
-        scalars = np.stack([fixed, discount, action], -1)
-        row = np.concatenate([state, next_state, next_base, scalars], -1)
+        scalars = (x[:, None] for x in (fixed, discount, action))
+        parts = (state, next_state, next_base, *scalars)
+        row = np.concatenate(parts, -1, dtype=np.float32, casting="same_kind")
         index = self.added % self.capacity
         self.rows[:, index] = torch.from_numpy(row)
         self.valid[:, index] = False

@@ -11,7 +11,7 @@ from bcrl.envs.car_on_hill import CarOnHill
 from bcrl.envs.maze import Maze
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.evaluation import metrics
-from bcrl.evaluation.oracle import available, cache, maze, oracles, reference
+from bcrl.evaluation.oracle import cache, has_oracle, maze, oracles, reference
 from bcrl.evaluation.oracle import car_on_hill as oracle
 from bcrl.evaluation.oracle.__main__ import main
 from bcrl.evaluation.oracle.car_on_hill import Search, cover, image_boxes
@@ -219,8 +219,8 @@ def test_an_oracle_is_for_its_own_class_of_environments(name):
         pass
 
     Other.name = name
-    assert not available(Other()) and reference(Other()) is None
-    assert available(Maze()) and not available(Richer())
+    assert not has_oracle(Other()) and reference(Other()) is None
+    assert has_oracle(Maze()) and not has_oracle(Richer())
     with pytest.raises(ConfigError, match=r"env\.metrics=q_error"):
-        metrics.check(["q_error"], Other())
+        metrics.check_metrics(["q_error"], Other())
     assert sorted(oracles()) == ["car_on_hill", "maze"]

@@ -11,7 +11,7 @@ from torch.nn import functional
 from bcrl.common.seeding import stream
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.evaluation.step_metrics import evaluate
-from bcrl.learning.dqn import BLOCK, DQN, DQNTrainer
+from bcrl.learning.dqn import DQN, DRAW_BLOCK, DQNTrainer
 from bcrl.learning.lspi import LSPI
 from bcrl.learning.replay import Replay
 from bcrl.learning.stage import snapshots
@@ -303,7 +303,7 @@ def test_the_recorded_loss_is_torchs_mean_since_the_last_snapshot(every):
     seeds, d, n = (4, 9), 4, 8
     run = trainer(settings, seeds=seeds)
     deep, replay = run.state.deep, run.state.replay
-    picks = [stream(s, "replay", 1, 0).random((BLOCK, 32)) for s in seeds]
+    picks = [stream(s, "replay", 1, 0).random((DRAW_BLOCK, 32)) for s in seeds]
     losses, sides = [[], []], set()
     for step in range(settings.length):
         run.act()

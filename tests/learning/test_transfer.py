@@ -12,7 +12,7 @@ from bcrl.envs.linear_system import LinearSystem
 from bcrl.errors import ConfigError
 from bcrl.evaluation.oracle.maze import optimal_q
 from bcrl.learning.bellman import precompute_target, residual_target, shaping
-from bcrl.learning.dqn import BLOCK, CHOICES, DQN, DQNTrainer
+from bcrl.learning.dqn import CHOICES, DQN, DRAW_BLOCK, DQNTrainer
 from bcrl.learning.policies import combined_actions
 from bcrl.learning.rollout import transition_tables
 from bcrl.learning.transfer import (
@@ -175,7 +175,7 @@ def test_the_horizons_end_is_bootstrapped_from_and_starts_anew():
         assert np.allclose(stored(run, step)["state"], before[0], atol=1e-6)
     moved = stored(run, 2)["after"] - stored(run, 3)["state"]
     assert np.abs(moved).max() > 1e-4
-    u = stream(0, "exploration", 2, 0).random((BLOCK, CHOICES + 12))[2]
+    u = stream(0, "exploration", 2, 0).random((DRAW_BLOCK, CHOICES + 12))[2]
     fresh = TARGET.initial(u[CHOICES + 8 :])
     assert np.allclose(stored(run, 3)["state"], fresh, atol=1e-6)
 
@@ -227,7 +227,7 @@ def test_the_residual_policy_in_a_run():
     prior, n = 4, CHOICES + TARGET.step_noise + TARGET.initial_noise
     behavior = ResidualPolicy(offset)
     run = run_of(StageInit(prior=Known(prior), behavior=behavior), settings)
-    draws = stream(0, "exploration", 2, 0).random((BLOCK, n))
+    draws = stream(0, "exploration", 2, 0).random((DRAW_BLOCK, n))
     table, decided, acted_alone = combined_actions(TARGET.actions), 0, 0
     for step in range(80):
         before, u = run.state.env_state.copy(), draws[step]

@@ -45,7 +45,7 @@ def _of(env: Env) -> ModuleType | None:
     return next(found, None)
 
 
-def available(env: Env) -> bool:
+def has_oracle(env: Env) -> bool:
     """Whether an oracle knows `env`."""
     return _of(env) is not None
 

@@ -13,7 +13,7 @@ from bcrl.errors import BcrlError
 from bcrl.evaluation.oracle import oracles
 
 
-def parser() -> argparse.ArgumentParser:
+def _parser() -> argparse.ArgumentParser:
     """A sub-command for each env with an oracle, an option for each of its fields."""
     top = argparse.ArgumentParser("python -m bcrl.oracle", description=__doc__)
     commands = top.add_subparsers(dest="env", required=True, metavar="ENV")
@@ -32,7 +32,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print a table; exit code 0, or 2 for arguments that the user can correct."""
     ready()
-    chosen = vars(parser().parse_args(arguments))
+    chosen = vars(_parser().parse_args(arguments))
     oracle = oracles()[chosen.pop("env")]
     try:
         env = oracle.ENV(**chosen)

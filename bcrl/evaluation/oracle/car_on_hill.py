@@ -27,13 +27,13 @@ ENV = CarOnHill
 #: Cells along each axis; the finer cover is for masses where the coarser prunes little.
 COVERS = (500, 2000)
 BUDGET = 20_000_000  # steps driven with one cover: about 20 s and 1 GiB
-LONGEST = 2000  # steps after which a path counts as unresolved
+_LONGEST = 2000  # steps after which a path counts as unresolved
 #: Box margin beyond the corners' images, in cells. A cell's image bends away from its
 #: corners' hull by less than a third of a cell: where paths cross p = 0 the flow's
 #: gradient jumps by up to |v| = 3 /s, elsewhere the flow is smooth.
-MARGIN = 0.5
-FAR = 32767  # bound of a cell from which the goal is out of reach
-LIMITS = np.array([MAX_POSITION, MAX_SPEED])
+_MARGIN = 0.5
+_FAR = 32767  # bound of a cell from which the goal is out of reach
+_LIMITS = np.array([MAX_POSITION, MAX_SPEED])
 
 
 def signed_steps(env: CarOnHill) -> NDArray[np.int64]:
@@ -87,21 +87,21 @@ def table(env: CarOnHill) -> Iterator[str]:
 def cover(mass: float, cells: int) -> tuple[NDArray[np.int64], Booleans]:
     """`bound` and `forever` of cells × cells cells, position-major.
 
-    `bound`: at least so many steps to the goal, `FAR` where it is out of reach.
+    `bound`: at least so many steps to the goal, `_FAR` where it is out of reach.
     `forever`: whether every state in the cell can avoid absorption forever.
     """
     low, high = image_boxes(mass, cells)
     slow = (high[..., 1] >= -MAX_SPEED) & (low[..., 1] <= MAX_SPEED)
     goal = slow & (high[..., 0] > MAX_POSITION)
     alive = slow & (high[..., 0] >= -MAX_POSITION) & (low[..., 0] <= MAX_POSITION)
-    safe = ((low >= -LIMITS) & (high <= LIMITS)).all(-1)
+    safe = ((low >= -_LIMITS) & (high <= _LIMITS)).all(-1)
     first, last = _cell(low, cells), _cell(high, cells) + 1
     # A cell is one step further from the goal than the nearest cell it may reach.
-    bound, steps = np.where(goal.any(0), 1, FAR), 1
+    bound, steps = np.where(goal.any(0), 1, _FAR), 1
     while (bound == steps).any():
         reaches = alive & (_count(bound <= steps, first, last) > 0)
         steps += 1
-        bound[reaches.any(0) & (bound == FAR)] = steps
+        bound[reaches.any(0) & (bound == _FAR)] = steps
     # Drop cells until the box of each one left has an action that stays among them.
     area, forever = (last - first).prod(-1), np.ones((cells, cells), bool)
     while True:
@@ -116,9 +116,9 @@ def image_boxes(mass: float, cells: int) -> tuple[Floats, Floats]:
 
     The leading axis is the action.
     """
-    axes = [np.linspace(-limit, limit, cells + 1) for limit in LIMITS]
+    axes = [np.linspace(-limit, limit, cells + 1) for limit in _LIMITS]
     corners = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    env, margin = CarOnHill(mass=mass), MARGIN * 2.0 * LIMITS / cells
+    env, margin = CarOnHill(mass=mass), _MARGIN * 2.0 * _LIMITS / cells
     low, high = np.empty((2, 2, cells, cells, 2))
     for action in (0, 1):
         image, _, _ = env.step(corners, np.full(corners.shape[:2], action))
@@ -130,7 +130,7 @@ def image_boxes(mass: float, cells: int) -> tuple[Floats, Floats]:
 
 def _cell(state: Floats, cells: int) -> NDArray[np.int64]:
     """Row and column (..., 2) of the cell of, or nearest to, states (..., 2)."""
-    scaled = np.nan_to_num((state / LIMITS + 1.0) * (cells / 2))
+    scaled = np.nan_to_num((state / _LIMITS + 1.0) * (cells / 2))
     return np.clip(scaled, 0, cells - 1).astype(np.int64)
 
 
@@ -159,8 +159,8 @@ class Search:
         start, _, reward, absorbing = self._branch(states, np.arange(len(states)))
         steps = reward.astype(np.int64)  # ±1 where the first step decides
         limit = self._of(self.bound, start)
-        waiting = np.flatnonzero(~absorbing & (limit < FAR))
-        never = np.flatnonzero(~absorbing & (limit == FAR))
+        waiting = np.flatnonzero(~absorbing & (limit < _FAR))
+        never = np.flatnonzero(~absorbing & (limit == _FAR))
         # Iterative deepening from the bound: the first limit that suffices is least.
         while waiting.size:
             arrived, cut = self._arrive(start, waiting, limit)
@@ -190,7 +190,7 @@ class Search:
             state, pair = state[going], pair[going]
             bound = self._of(self.bound, state)
             late = depth + bound > limit[pair]
-            cut[pair[late & (bound < FAR)]] = True
+            cut[pair[late & (bound < _FAR)]] = True
             state, pair = state[~late], pair[~late]
         return arrived, cut
 
@@ -204,7 +204,7 @@ class Search:
             if not pair.size:
                 return np.where(forever, 0, latest)
             depth += 1
-            if depth > LONGEST:
+            if depth > _LONGEST:
                 raise TooLong
             latest[pair] = depth
             state, pair, _, absorbing = self._branch(state, pair)
