@@ -58,7 +58,7 @@ class Stopwatch:
 
 
 def by_turns(runs: list[Iterator[Iteration]]) -> list[tuple[float, float]]:
-    """The least CPU milliseconds of an iteration of each, and its nodes a tree."""
+    """The least CPU milliseconds of an iteration of each, and its nodes per tree."""
     for run in runs:
         for _ in range(EARLY):
             next(run)
@@ -88,16 +88,16 @@ def residuals() -> None:
     one, forty = by_turns([iterations(1000, 1, start) for start in starts])
     points = len(first.result.data[0].points)
     for number, (took, nodes) in ((1, one), (RESIDUAL, forty)):
-        print(f"residual {number:2}: {took:7.1f} ms, {nodes:.0f} nodes a tree")
+        print(f"residual {number:2}: {took:7.1f} ms, {nodes:.0f} nodes per tree")
     print(f"ratio: {forty[0] / one[0]:.3f}")
-    print(f"once a stage: base at {points} points, {base.seconds * 1e3:.0f} ms")
+    print(f"once per stage: base at {points} points, {base.seconds * 1e3:.0f} ms")
 
 
 def main() -> None:
     residuals()
     sizes = [(250, 1), (500, 1), (1000, 1), (250, 2), (250, 4)]
     times = by_turns([iterations(*size) for size in sizes])
-    print(f"\n{'episodes':>9}{'seeds':>7}{'ms an iteration':>17}{'nodes a tree':>14}")
+    print(f"\n{'episodes':>9}{'seeds':>7}{'ms per iteration':>17}{'nodes/tree':>12}")
     for (episodes, seeds), (took, nodes) in zip(sizes, times, strict=True):
         print(f"{episodes:9}{seeds:7}{took:17.1f}{nodes:14.0f}")
 

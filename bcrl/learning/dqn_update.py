@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bcrl.learning import Floats
 from bcrl.learning.replay import Replay
-from bcrl.q import compiled
+from bcrl.q.networks import cpu
 from bcrl.q.networks.mlp import DeepQ, Networks
 
 #: (indices (T, S, B), next states (S, d)) → losses (S,), and ϱ's values (S, A) at these
@@ -59,22 +59,19 @@ def batched(deep: DeepQ, replay: Replay) -> Update:
 def one_by_one(deep: DeepQ, replay: Replay) -> Update:
     """One seed after the other in compiled code."""
     buffers = (deep.online.flat, deep.target.flat, deep.optimiser.moments)
-    online, target, moments = (buffer.numpy() for buffer in buffers)
+    networks = tuple(buffer.numpy() for buffer in buffers)
     sizes, layout = np.array(deep.online.sizes), (replay.d, replay.n_actions)
     stored = (replay.rows.numpy(), replay.bootstrap, replay.valid)
 
     def update(
         indices: NDArray[np.int64], next_states: Floats
     ) -> tuple[Floats, NDArray[np.float32]]:
-        adam, loss = deep.optimiser.next_step(), np.empty(len(online))
-        next_values = np.empty((len(online), replay.n_actions), np.float32)
+        adam, loss = deep.optimiser.next_step(), np.empty(len(networks[0]))
+        next_values = np.empty((len(loss), replay.n_actions), np.float32)
         if len(indices) > 1:
-            compiled.renew_ahead(target, sizes, *stored, replay.size, indices, layout)
-        networks, outputs = (online, target, moments, sizes), (loss, next_values)
-        batch = (*stored, indices[0], layout)
-        compiled.update(
-            *networks, *batch, adam, next_states.astype(np.float32), *outputs
-        )
+            cpu.renew_ahead(networks[1], sizes, stored, replay.size, indices, layout)
+        states, outputs = next_states.astype(np.float32), (loss, next_values)
+        cpu.update(networks, sizes, stored, indices[0], layout, adam, states, *outputs)
         return loss, next_values
 
     return update

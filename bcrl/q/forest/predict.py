@@ -1,33 +1,31 @@
-"""Compiled extra-trees: rows going down a grown forest."""
+"""Compiled extra-trees: moving rows down a grown forest."""
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from bcrl.q.forest.kernel import ZERO, U, bare, key_of
-from bcrl.q.forest.rows import add_value, move_queries, new_rows, plane
+from bcrl.common.compiling import kept
+from bcrl.q.forest.buffers import add_value, move_rows, new_rows, plane
+from bcrl.q.forest.split import U, key_of, uncounted
 
-#: Rows from which moving them down a tree together beats walking one by one.
+#: From so many rows on, it is faster to move them down a tree together.
 TOGETHER = 1000
 
 
-@bare
-def send_down(keys, words, row, d, nodes, values, root, stack, total):
+@uncounted
+def _move_down(rows, d, nodes, values, root, stack, total):
     """Add one tree's predictions to `total`, moving all rows down together."""
     node, depth, top = root, 0, 0
-    size = U(total.size)
-    start, stop = ZERO, size
+    n = U(total.size)
+    start, stop = U(0), n
     while True:
         child = nodes[node].child
         if nodes[node].feature < 0:
-            here = plane(depth) * size
-            add_value(row, here + start, here + stop, values[child], total)
+            here = plane(depth) * n
+            add_value(rows.origin, here + start, here + stop, values[child], total)
         else:
             cut, feature = nodes[node].cut, nodes[node].feature
-            middle = move_queries(
-                keys, words, row, size, d, depth, start, stop, feature, cut
-            )
+            middle = move_rows(rows, n, d, depth, start, stop, feature, cut)
             depth += 1
             if middle < stop:
                 stack[top, 0], stack[top, 1] = child + 1, depth
@@ -43,9 +41,9 @@ def send_down(keys, words, row, d, nodes, values, root, stack, total):
         start, stop = U(stack[top, 2]), U(stack[top, 3])
 
 
-@bare
-def walk_down(keys, nodes, values, root, at, who, total):
-    """Add one tree's predictions to `total`, all rows taking one level a turn.
+@uncounted
+def _walk_down(keys, nodes, values, root, at, who, total):
+    """Add one tree's predictions to `total`, level by level for all rows.
 
     Rows that walk side by side wait for memory at the same time, not one after another.
     """
@@ -66,23 +64,21 @@ def walk_down(keys, nodes, values, root, at, who, total):
         left = kept
 
 
-@njit
+@kept(nogil=True)
 def predict_forest(nodes, values, first, x):
-    """Mean over the trees at `x` (m, d) float32, as float64 (m,)."""
-    trees = first.size - 1
-    total, d = np.zeros(x.shape[0]), U(x.shape[1])
-    if x.shape[0] >= TOGETHER:
-        keys, words, row, _, _ = new_rows(x, False, False)
-        stack = np.empty((x.shape[0] + 1, 4), np.int64)
+    """Mean over the trees at x (m, d) float32, as float64 (m,)."""
+    trees, (m, d) = first.size - 1, x.shape
+    total = np.zeros(m)
+    if m >= TOGETHER:
+        rows, stack = new_rows(x, False, False), np.empty((m + 1, 4), np.int64)
         for t in range(trees):
-            root = first[t]
-            send_down(keys, words, row, d, nodes, values, root, stack, total)
+            _move_down(rows, U(d), nodes, values, first[t], stack, total)
     else:
-        walking = np.empty(x.shape, np.int32)
-        at, who = np.empty((2, x.shape[0]), np.int64)
-        for i in range(x.shape[0]):
-            for f in range(x.shape[1]):
-                walking[i, f] = key_of(x[i, f])
+        keys = np.empty(x.shape, np.int32)
+        at, who = np.empty((2, m), np.int64)
+        for i in range(m):
+            for f in range(d):
+                keys[i, f] = key_of(x[i, f])
         for t in range(trees):
-            walk_down(walking, nodes, values, first[t], at, who, total)
+            _walk_down(keys, nodes, values, first[t], at, who, total)
     return total / trees

@@ -1,4 +1,4 @@
-"""Compiled parts of the forest: keys, random cuts, the choice of a split.
+"""Compiled parts of the forest: keys, random cuts and the choice of a split.
 
 Three representations make the loops fast and the results exact:
 
@@ -6,7 +6,7 @@ Three representations make the loops fast and the results exact:
   that comparisons and minima are integer operations, which vectorise;
 * targets are **fixed-point** int64, so that sums are exact and independent of the order
   of rows, of the vector width and of the machine (sums of floats are none of these);
-* the rows of a node lie side by side, a row's keys next to each other (`rows`).
+* the rows of a node lie side by side, a row's keys next to each other (`buffers`).
 
 Because sums are exact, a row of multiplicity 3 and three equal rows give the same tree
 bit for bit, and so does any order of the rows.
@@ -16,12 +16,12 @@ Indices are unsigned because numba checks signed ones for being negative.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-
-from bcrl.q.forest.lanes import extremes, tally, tally_weighted
 
 #: One tree node, 12 bytes: rows with `key <= cut` go to node `child`, others to
 #: `child + 1`; a leaf has feature −1 and its value at `child` in the leaf values.
@@ -34,32 +34,32 @@ PURE = float(np.finfo(np.float64).eps)
 CONSTANT = np.float32(1e-7)
 
 U = np.uint64
-ZERO, ONE, TWO = U(0), U(1), U(2)
 GOLDEN, LOW32 = U(0x9E3779B97F4A7C15), U(0xFFFFFFFF)
 SIGN, REST = np.int32(31), np.int32(0x7FFFFFFF)
+HALF = np.int64(32)  # bits of a key in a word
 
 
-#: Functions that neither make nor keep arrays need no counting of references to them,
-#: which costs more than the work in a small node does.
-bare = njit(_nrt=False)
-#: The same, woven into the caller: passing arrays costs as much again.
-woven = njit(_nrt=False, inline="always")
+#: Functions that neither make nor keep arrays need no reference counting, which costs
+#: more than the work in a small node.
+uncounted: Callable[[Callable], Callable] = partial(njit, _nrt=False)()
+#: The same, inlined into the caller, because passing arrays costs as much again.
+inlined: Callable[[Callable], Callable] = partial(njit, _nrt=False, inline="always")()
 
 
-@woven
+@inlined
 def key_of(value):
     """The int32 that orders like the float32 `value`; −0 is taken as +0."""
     bits = np.float32(value + np.float32(0.0)).view(np.int32)
     return np.int32(bits ^ ((bits >> SIGN) & REST))
 
 
-@woven
+@inlined
 def value_of(key):
     """The float32 that the int32 `key` stands for."""
     return np.int32(key ^ ((key >> SIGN) & REST)).view(np.float32)
 
 
-@woven
+@inlined
 def mix(state):
     """Output function of splitmix64 (Steele, Lea and Flood 2014), uint64 to uint64."""
     z = (state ^ (state >> U(30))) * U(0xBF58476D1CE4E5B9)
@@ -67,7 +67,7 @@ def mix(state):
     return z ^ (z >> U(31))
 
 
-@woven
+@inlined
 def draw_cut(low, high, bits):
     """Key of a threshold uniform on [low, high), given 32 random bits.
 
@@ -91,17 +91,17 @@ class Split(NamedTuple):
     total: np.int64
 
 
-@woven
+@inlined
 def is_pure(target, weight, start, stop, total_weight, unit):
     """Whether the variance of the targets at `start:stop` is at most PURE.
 
     Two rows at a distance δ alone give a variance of δ² / (2 · total weight) or more:
-    a mixed node is told after a row or two.
+    a mixed node is recognised after a row or two.
     """
     first = target[start]
     limit = 2.0 * total_weight * PURE
     mean, square = 0.0, 0.0
-    for i in range(start + ONE, stop):
+    for i in range(start + U(1), stop):
         far = np.float64(target[i] - first) * unit
         if far * far > limit:
             return False
@@ -111,9 +111,9 @@ def is_pure(target, weight, start, stop, total_weight, unit):
     return square - mean * mean <= PURE
 
 
-@woven
-def gain(low, high, weight, total, node_weight, node_total, min_leaf):
-    """Variance reduction of a split up to a factor common to the node; −1: not allowed.
+@inlined
+def _gain(low, high, weight, total, node_weight, node_total, min_leaf):
+    """Variance reduction of a split up to a factor of the node; −1 if not allowed.
 
     Mirrored splits give exactly the same number, so that ties are ties.
     """
@@ -128,59 +128,57 @@ def gain(low, high, weight, total, node_weight, node_total, min_leaf):
     return gap * gap / (np.float64(weight) * right)
 
 
-@woven
-def choose_two(
-    words, target, weight, here, start, stop, w_node, s_node, min_leaf, state
-):
-    """`choose` for two features, both tried: both in one pass over the rows."""
-    first, last = here + start, here + stop
-    low0, high0, low1, high1 = extremes(words, first, last)
+@inlined
+def choose_two(rows, first, last, node_weight, node_total, min_leaf, state):
+    """`choose` for two features that are both tried, in two passes over the rows."""
+    words, target, weight = rows.words, rows.target, rows.weight
+    low0 = high0 = np.int32(words[first])
+    low1 = high1 = np.int32(words[first] >> HALF)
+    for i in range(first + U(1), last):
+        key0, key1 = np.int32(words[i]), np.int32(words[i] >> HALF)
+        low0, high0 = min(low0, key0), max(high0, key0)
+        low1, high1 = min(low1, key1), max(high1, key1)
     state += GOLDEN
     bits = mix(state)
     cut0 = draw_cut(low0, high0, bits >> U(32))
     cut1 = draw_cut(low1, high1, bits & LOW32)
-    if weight.size > 0:
-        found = tally_weighted(words, target, weight, first, last, cut0, cut1)
-    else:
-        found = tally(words, target, first, last, cut0, cut1)
-    w0, s0, w1, s1 = found
-    gain0 = gain(low0, high0, w0, s0, w_node, s_node, min_leaf)
-    gain1 = gain(low1, high1, w1, s1, w_node, s_node, min_leaf)
+    weight0 = total0 = weight1 = total1 = np.int64(0)
+    for i in range(first, last):
+        left0 = -np.int64(np.int32(words[i]) <= cut0)  # all bits, or none
+        left1 = -np.int64(np.int32(words[i] >> HALF) <= cut1)
+        w, y = np.int64(1), target[i]
+        if weight.size > 0:
+            w = weight[i]
+            y *= w
+        weight0 += w & left0
+        total0 += y & left0
+        weight1 += w & left1
+        total1 += y & left1
+    gain0 = _gain(low0, high0, weight0, total0, node_weight, node_total, min_leaf)
+    gain1 = _gain(low1, high1, weight1, total1, node_weight, node_total, min_leaf)
     second = gain1 > gain0
     if gain0 == gain1:
         state += GOLDEN
-        second = (mix(state) >> U(63)) == ONE
+        second = (mix(state) >> U(63)) == U(1)
     if max(gain0, gain1) < 0.0:
-        return Split(-1, cut0, w0, s0), state
+        return Split(-1, cut0, weight0, total0), state
     if second:
-        return Split(1, cut1, w1, s1), state
-    return Split(0, cut0, w0, s0), state
+        return Split(1, cut1, weight1, total1), state
+    return Split(0, cut0, weight0, total0), state
 
 
-@bare
-def choose(
-    keys,
-    target,
-    weight,
-    base,
-    here,
-    start,
-    stop,
-    w_node,
-    s_node,
-    min_leaf,
-    state,
-    max_features,
-    order,
-):
+@uncounted
+def choose(rows, first, last, node_weight, node_total, limits, state, order):
     """The best of the tried features by variance reduction, each cut at random.
 
-    Features are visited in random order: ties between them fall either way. As in
-    scikit-learn a constant feature counts as tried, but at least one other is.
-    base, here: where the node's plane begins in keys, and in everything else; w_node,
-    s_node: weight and sum of the node; order: (d,) a permutation
-    of the features, shuffled further.
+    Features are visited in random order, so that ties between them fall either way. A
+    constant feature counts as tried, but at least one other is tried (scikit-learn's).
+    first, last: the node's rows in its plane; node_weight, node_total: their weight and
+    their sum of targets; limits: (min_samples_leaf, max_features); order: (d,) a
+    permutation of the features, which is shuffled further. Returns a Split and `state`.
     """
+    keys, target, weight, d = rows.keys, rows.target, rows.weight, U(order.size)
+    min_leaf, max_features = limits
     best, split = -1.0, Split(-1, np.int32(0), np.int64(0), np.int64(0))
     left = order.size
     tried, constants = 0, 0
@@ -191,11 +189,10 @@ def choose(
         left -= 1
         tried += 1
         feature = order[pick]
-        order[pick] = order[left]
-        order[left] = feature
-        column, d = base + U(feature), U(order.size)
-        low = high = keys[column + start * d]
-        for i in range(start + ONE, stop):
+        order[pick], order[left] = order[left], feature
+        column = U(feature)
+        low = high = keys[column + first * d]
+        for i in range(first + U(1), last):
             key = keys[column + i * d]
             low, high = min(low, key), max(high, key)
         if value_of(high) <= np.float32(value_of(low) + CONSTANT):
@@ -203,15 +200,12 @@ def choose(
             continue
         cut = draw_cut(low, high, bits >> U(32))
         w = s = np.int64(0)
-        for i in range(start, stop):
-            goes = -np.int64(keys[column + i * d] <= cut)
-            if weight.size > 0:
-                w += weight[here + i] & goes
-                s += (weight[here + i] * target[here + i]) & goes
-            else:
-                w -= goes
-                s += target[here + i] & goes
-        score = gain(low, high, w, s, w_node, s_node, min_leaf)
+        for i in range(first, last):
+            goes_left = -np.int64(keys[column + i * d] <= cut)  # all bits, or none
+            count = weight[i] if weight.size > 0 else np.int64(1)
+            w += count & goes_left
+            s += (count * target[i]) & goes_left
+        score = _gain(low, high, w, s, node_weight, node_total, min_leaf)
         if score > best:
             best, split = score, Split(feature, cut, w, s)
     return split, state
