@@ -18,6 +18,7 @@ from bcrl.common.files import make_directory
 from bcrl.common.signals import EXIT_CODE, Interrupted, heard
 from bcrl.common.terminal import ready, say, show
 from bcrl.config import guard, shell
+from bcrl.config.describe import describe
 from bcrl.config.hydra_compose import CONF, CONFIG_NAME
 from bcrl.errors import BcrlError
 
@@ -37,6 +38,9 @@ def main() -> None:
             arguments = shell.arguments()
             if arguments.help:
                 show(shell.manual(arguments.config_dir))
+                return
+            if arguments.describe is not None:
+                show(describe(arguments.describe))
                 return
             if plans := _vet(arguments):
                 make_directory(plans[0].root, "runs_dir")
@@ -63,18 +67,17 @@ def _vet(arguments: Namespace) -> list[Plan]:
         _by_hydra(arguments)
         return []
     from bcrl.config import vetting
-    from bcrl.run import records
-    from bcrl.run import status as overview
+    from bcrl.run import records, status
 
     if arguments.status:
-        show(overview.status(arguments))
+        show(status.status(arguments))
         return []
     plans = vetting.plans(arguments)
     if not (arguments.cfg or arguments.info):
         for plan in plans:
             records.check_directory(plan)
     if arguments.dry_run:
-        show(overview.dry_run(plans))
+        show(status.dry_run(plans))
         return []
     if arguments.cfg or arguments.info:
         _by_hydra(arguments)
@@ -82,7 +85,7 @@ def _vet(arguments: Namespace) -> list[Plan]:
     if vetting.left_to_hydra(arguments):
         from bcrl.run import launchers, runner
 
-        launchers.register()
+        launchers.register_slurm()
         heard()
         _by_hydra(arguments)
         runner.check_complete(plans)

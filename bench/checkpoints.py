@@ -13,7 +13,8 @@ import time
 from argparse import Namespace
 
 from bcrl.config import schema, vetting
-from bcrl.run import checkpoints, records, runner
+from bcrl.results.layout import seed_path
+from bcrl.run import checkpoints, runner
 
 CHOICES = {
     "maze FQI": ["env=maze", "seeds.count=4"],
@@ -53,11 +54,11 @@ def main(every: str = "60") -> None:
                 config_name=None,
             )
             (plan,) = vetting.plans(asked)
-            timed = Timed(checkpoints.save)
-            checkpoints.save = timed
+            timed = Timed(checkpoints.save_checkpoint)
+            checkpoints.save_checkpoint = timed
             runner.run(plan)
-            checkpoints.save = timed.function
-            facts = records.seed_path(plan.directory, 0, "json").read_text()
+            checkpoints.save_checkpoint = timed.function
+            facts = seed_path(plan.directory, 0, "json").read_text()
             run = json.loads(facts)["wall_seconds"]
         each = 1e3 * timed.seconds / max(1, timed.calls)
         print(

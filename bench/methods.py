@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from bcrl.config import schema, vetting
 from bcrl.config.plan import Plan
 from bcrl.evaluation.step_metrics import evaluate
-from bcrl.learning.lockstep import DQNTrainer
+from bcrl.learning.dqn import DQNTrainer
 from bcrl.learning.stage import SeedBatch, learn
 from bcrl.learning.transfer import begin
 
@@ -39,11 +39,11 @@ def planned(variant: str) -> Plan:
 
 def running(plan: Plan, seeds: tuple[int, ...]) -> DQNTrainer:
     """A team in its target task with a full replay."""
-    team, learned = SeedBatch(seeds, np.zeros((1, 4))), None
-    for now in learn(plan.stages[:-1], team):
-        learned = now.learned
+    batch, result = SeedBatch(seeds, np.zeros((1, 4))), None
+    for now in learn(plan.stages[:-1], batch):
+        result = now.result
     last = plan.stages[-1]
-    run = DQNTrainer(last.learner, last, begin(last.transfers, learned), team)
+    run = DQNTrainer(last.learner, last, begin(last.transfers, result), batch)
     for _ in range(last.learner.replay_size):
         run.act()
         run.end_step()
@@ -55,7 +55,7 @@ def running(plan: Plan, seeds: tuple[int, ...]) -> DQNTrainer:
 
 def cost(run: DQNTrainer) -> tuple[float, float]:
     """Seconds of CPU of a step with its update, and of an evaluation a step."""
-    n = len(run.team.seeds)
+    n = len(run.batch.seeds)
     began = time.process_time()
     for _ in range(STEPS):
         run.act()
@@ -63,7 +63,7 @@ def cost(run: DQNTrainer) -> tuple[float, float]:
         run.end_step()
     stepping = (time.process_time() - began) / STEPS / n
     began = time.process_time()
-    evaluate(run.moment(), run.team.seeds)
+    evaluate(run.snapshot(), run.batch.seeds)
     every = run.settings.evaluate_every
     return stepping, (time.process_time() - began) / every / n
 

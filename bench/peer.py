@@ -99,7 +99,7 @@ def our_fqi() -> Callable[[], object]:
     env = CarOnHill(mass=1.0)
     stage = Stage(1, 1, env, FQI(10**9, EPISODES, ForestRegressor()), (), 0)
     run = learn([stage], SeedBatch((0,), probed_states(env)))
-    (data,) = next(run).learned.data
+    (data,) = next(run).result.data
     print(f"our dataset: {int(data.multiplicity.sum())} transitions")
     return lambda: next(run)
 

@@ -211,5 +211,5 @@ def _tasks(section: Plain) -> tuple[list[Env], tuple[str, ...]]:
     metrics = section.get("metrics")
     if not isinstance(metrics, list) or not metrics:
         raise ConfigError("env.metrics", metrics, "must be a list of metric names")
-    probes.check(metrics, tasks[-1])
+    probes.check_metrics(metrics, tasks[-1])
     return tasks, tuple(metrics)

@@ -104,6 +104,8 @@ def parser() -> argparse.ArgumentParser:
     result.prog = "bcrl"
     shown = next(a for a in result._actions if "--version" in a.option_strings)
     shown.version, shown.help = f"bcrl {__version__}", "show bcrl's version"
+    about = "explain a key or group; without KEY, list all keys"
+    result.add_argument("--describe", metavar="KEY", nargs="?", const="", help=about)
     result.add_argument("--dry-run", action="store_true", help="list jobs and costs")
     result.add_argument("--runs-dir", metavar="PATH", help="as runs_dir=PATH")
     result.error = _refuse

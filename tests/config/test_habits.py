@@ -232,7 +232,7 @@ def test_a_checkpoint_tells_how_far_its_seeds_are(tmp_path, monkeypatch):
         "seeds.count=1",
         "tag=t",
     )
-    real, saved = checkpoints.save, []
+    real, saved = checkpoints.save_checkpoint, []
 
     def save(*given):
         saved.append(given[2])
@@ -240,11 +240,11 @@ def test_a_checkpoint_tells_how_far_its_seeds_are(tmp_path, monkeypatch):
         if len(saved) == 6:
             raise MemoryError
 
-    monkeypatch.setattr(checkpoints, "save", save)
+    monkeypatch.setattr(checkpoints, "save_checkpoint", save)
     with pytest.raises(runner.SeedsFailed):
         runner.run(p)
     assert saved == sorted(saved) and 0 < saved[-1] < 1
-    assert checkpoints.teams(p) == {(0,): saved[-1]}
+    assert checkpoints.batches(p) == {(0,): saved[-1]}
     assert checkpoints.shares(p.directory) == {0: saved[-1]}
     records.write_status(p, 0, "running", {})
     row = overview.status(arguments(f"runs_dir={tmp_path}")).splitlines()[1]

@@ -12,7 +12,7 @@ from bcrl import cli
 from bcrl.config import guard, shell, vetting
 from bcrl.errors import BcrlError
 from bcrl.report import cli as report
-from bcrl.report import verify
+from bcrl.results import verify
 from bcrl.run import runner, status
 from tests.conftest import plan, plans
 
@@ -233,7 +233,7 @@ def test_seeds_are_how_many_or_which(typed, seeds):
 def test_seeds_are_swept_and_stand_in_files(tmp_path):
     swept = plans(MAZE, "seed=0,4", multirun=True)
     assert [p.seeds for p in swept] == [(0,), (4,)]
-    assert next(runner.merged(swept)).seeds == (0, 4)
+    assert runner.merged(swept)[0].seeds == (0, 4)
     for text, seeds in (
         ("seeds: 2", (0, 1)),
         ("seeds: [3, 7]", (3, 7)),

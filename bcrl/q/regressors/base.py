@@ -151,7 +151,9 @@ def _reason(regressor: Regressor, what: str, error: Exception) -> str:
 class Threads(Protocol):
     """An object with the number of threads that predictions may use."""
 
-    threads: int
+    @property
+    def threads(self) -> int:
+        """The number of threads."""
 
 
 @storable
