@@ -31,6 +31,8 @@ def _grow_tree(
     min_split, min_leaf, max_features, max_depth = settings
     node_weight, node_total, unit = whole
     order, stack = work
+    for f in range(order.size):  # a tree depends on its seed alone
+        order[f] = f
     nodes, values = tree
     n_nodes, n_values = at
     node, depth, deepest, top = n_nodes, 0, 0, 0
