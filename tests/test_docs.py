@@ -79,6 +79,13 @@ def test_named_files_exist(page):
         assert (ROOT / name).exists(), name
 
 
+def test_pages_that_code_and_configs_name_exist():
+    for folder, ending in (("bcrl", "py"), ("conf", "yaml"), ("examples", "py")):
+        for path in (ROOT / folder).rglob(f"*.{ending}"):
+            for name in re.findall(r"docs/[\w/]+\.md", path.read_text("utf-8")):
+                assert (ROOT / name).exists(), (path, name)
+
+
 SHORT = {
     **{"FQI": "fitted Q-iteration", "DQN": "deep Q-network", "LQ": "linear-quadratic"},
     **{"LSPI": "least-squares policy iteration", "IQM": "interquartile mean"},
