@@ -12,7 +12,7 @@ import tempfile
 import time
 from argparse import Namespace
 
-from bcrl.config import schema, vetting
+from bcrl.config import jobs, schema
 from bcrl.run import checkpoints, records, runner
 
 CHOICES = {
@@ -52,7 +52,7 @@ def main(every: str = "60") -> None:
                 config_dir=None,
                 config_name=None,
             )
-            (plan,) = vetting.plans(asked)
+            (plan,) = jobs.plans(asked)
             timed = Timed(checkpoints.save)
             checkpoints.save = timed
             runner.run(plan)

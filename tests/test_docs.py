@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bcrl.config import shell, vetting
+from bcrl.config import flags, jobs
 from bcrl.run import status as overview
 
 ROOT = Path(__file__).parents[1]
@@ -30,9 +30,9 @@ COMMANDS = [(page.name, line) for page in PAGES for line in commands(page)]
 def test_every_command_would_run(page, line, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = shlex.split(line, comments=True)[1:]
-    asked = shell.parser().parse_intermixed_args(words)
+    asked = flags.parser().parse_intermixed_args(words)
     if not asked.status:
-        assert "nothing was run" in overview.dry_run(vetting.plans(asked))
+        assert "nothing was run" in overview.dry_run(jobs.plans(asked))
 
 
 def test_links_lead_somewhere():

@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
 from collections.abc import Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from bcrl.common import plugins, serialization
+from bcrl.common import serialization
 from bcrl.common.files import write_atomically
 from bcrl.common.identity import identity
 from bcrl.config.plan import Plan
@@ -115,6 +114,7 @@ def _about(plan: Plan) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         "code": _code(),
+        "sources": plan.sources,
         "config": hashlib.sha256(config.encode()).hexdigest(),
         "device": plan.device,
     }
@@ -124,22 +124,16 @@ def _ours() -> bytes:
     """A fingerprint of this package's sources that compute."""
     package = Path(__file__).resolve().parents[1]
     found = (p for p in package.rglob("*.py") if package / "report" not in p.parents)
-    return _fingerprint(sorted(found))
-
-
-def _fingerprint(sources: Sequence[Path]) -> bytes:
-    return hashlib.sha256(b"".join(p.read_bytes() for p in sources)).digest()
+    sources = (path.read_bytes() for path in sorted(found))
+    return hashlib.sha256(b"".join(sources)).digest()
 
 
 @cache
 def _code() -> str:
-    """A fingerprint of all that computes: sources, the user's too, and libraries."""
+    """A fingerprint of this package's sources and of the libraries that compute."""
     versions = repr([version(name) for name in LIBRARIES]).encode()
-    parts = (OURS, _fingerprint(plugins.sources()), versions)
-    return hashlib.sha256(b"".join(parts)).hexdigest()
+    return hashlib.sha256(OURS + versions).hexdigest()
 
 
 #: Taken now, at the start: a file may change on disk, the code that runs doesn't.
 OURS = _ours()
-if os.environ.get(plugins.VARIABLE):
-    _code()

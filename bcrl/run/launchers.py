@@ -29,7 +29,7 @@ from omegaconf import DictConfig
 
 from bcrl.common.signals import EXIT_CODE, Interrupted, Stop
 from bcrl.common.terminal import say
-from bcrl.config import guard, vetting
+from bcrl.config import jobs as planning
 from bcrl.config import plan as compose
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.run import records
@@ -67,7 +67,7 @@ class Local(JoblibLauncher):
             jobs = [[*job, f"threads={max(1, each // at_once)}"] for job in jobs]
         self.task_function = partial(_unless_stopped, self.task_function)
         stop = _PassedOn()
-        with stop.on_signals(second_ends_all=True), guard.unregistered():
+        with stop.on_signals(second_ends_all=True):
             try:
                 return super().launch(jobs, initial_job_idx)
             except BrokenExecutor as error:
@@ -130,8 +130,7 @@ class Slurm(SlurmLauncher):
         more = {"requeue": True}  # also after a node's failure
         params |= {"slurm_srun_args": srun, "slurm_additional_parameters": more}
         executor.update_parameters(**params)
-        with guard.unregistered():
-            state = Singleton.get_state()
+        state = Singleton.get_state()
         rows = [(job, "hydra.sweep.dir", n, "", state) for n, job in enumerate(jobs)]
         arrays: list[str] = []
         stop = Stop()
@@ -241,7 +240,7 @@ def _divided(launcher: Local | Slurm, jobs: Jobs, size: int | None) -> list[list
     divided = []
     for overrides in map(list, jobs):
         config = load(launcher.config, overrides)
-        plan = vetting.job(config, config.hydra)
+        plan = planning.plan_of_job(config, config.hydra)
         parts: list[str | None] = [None]
         if size and config.seeds.part is None:
             number = -(-len(plan.seeds) // size)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from bcrl.common import files
-from bcrl.config import vetting
+from bcrl.config import jobs
 from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
 from bcrl.run import checkpoints, costs, locks, records, runner
@@ -81,14 +81,14 @@ def status(arguments: Namespace) -> str:
     """
     if all(override.startswith("runs_dir=") for override in arguments.overrides):
         any_ = [*arguments.overrides, "env=maze"]  # it is a required choice
-        (plan,) = vetting.plans(Namespace(**vars(arguments) | {"overrides": any_}))
+        (plan,) = jobs.plans(Namespace(**vars(arguments) | {"overrides": any_}))
         root = plan.root
         folders = sorted(path.parent for path in root.glob("*/*/*/config.yaml"))
         if not folders:
             raise BcrlError(f"runs_dir={root}: holds no runs")
         variants = [_measure(folder, _ever_asked(folder)) for folder in folders]
     else:
-        plans = runner.merged(vetting.plans(arguments))
+        plans = runner.merged(jobs.plans(arguments))
         variants = [_measure(p.directory, p.seeds, costs.expected(p)) for p in plans]
     rows = [("", "seeds", *STATES, "done", "core min left")]
     for asked in variants:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from bcrl.config import vetting
+from bcrl.config import jobs
 from bcrl.errors import BcrlError
 from bcrl.learning.curriculum import CURRICULA
 from bcrl.learning.dqn import DQN
@@ -15,9 +15,9 @@ from bcrl.learning.transfer import Boost, PolicyReuse, ResidualPolicy, Shape, wa
 from tests.conftest import plan, plans
 
 GROUPS = {
-    group: sorted(p.stem for p in (vetting.CONF / group).glob("*.yaml"))
+    group: sorted(p.stem for p in (jobs.CONF / group).glob("*.yaml"))
     for group in (
-        *vetting.VARIANT_GROUPS,
+        *jobs.VARIANT_GROUPS,
         "algorithm/regressor",
         "budget",
         "variant",
@@ -25,7 +25,7 @@ GROUPS = {
     )
 }
 #: What stands by itself; the other env wants an id (tests/test_gymnasium.py).
-ENVS = [env for env in GROUPS["env"] if env != vetting.OPEN]
+ENVS = [env for env in GROUPS["env"] if env != jobs.OPEN]
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_a_composition_of_ones_own_gets_a_directory_of_its_own():
 
 def test_options_of_ones_own_never_pass_for_the_shipped_ones(tmp_path, monkeypatch):
     (tmp_path / "algorithm").mkdir()
-    shipped = (vetting.CONF / "algorithm" / "fqi.yaml").read_text()
+    shipped = (jobs.CONF / "algorithm" / "fqi.yaml").read_text()
     big = shipped.replace("- regressor: forest", "- regressor: sklearn_forest")
     (tmp_path / "algorithm" / "big.yaml").write_text(big)
     (own,) = plans("env=maze", "algorithm=big", config_dir=str(tmp_path))
@@ -176,7 +176,7 @@ def test_every_regressor_and_budget_composes_or_is_refused_with_a_reason(env):
     for budget in GROUPS["budget"]:
         algorithm = budget.rsplit("_", 1)[1]
         ended = outcome([f"env={env}", f"algorithm={algorithm}", f"budget={budget}"])
-        values = yaml.safe_load((vetting.CONF / f"budget/{budget}.yaml").read_text())
+        values = yaml.safe_load((jobs.CONF / f"budget/{budget}.yaml").read_text())
         lengths = {len(value) for value in values.values() if isinstance(value, list)}
         assert (ended != "refused") == (lengths <= {n_tasks}), budget
 
@@ -250,13 +250,13 @@ def test_a_users_folder_adds_options_of_its_own(tmp_path):
     text = "# @package _global_\ndefaults:\n  - override /env: maze\ntag: mine\n"
     (tmp_path / "experiment" / "mine.yaml").write_text(text)
     (tmp_path / "env").mkdir()
-    shipped = (vetting.CONF / "env" / "maze.yaml").read_text()
+    shipped = (jobs.CONF / "env" / "maze.yaml").read_text()
     low = shipped.replace("0.85, 0.95]", "0.85, 0.9]")
     (tmp_path / "env" / "low_maze.yaml").write_text(low)
     (own,) = plans("experiment=mine", config_dir=str(tmp_path))
     assert own.name == "FQI@mine"
     (tmp_path / "budget").mkdir()
-    budget = (vetting.CONF / "budget" / "maze_fqi.yaml").read_text()
+    budget = (jobs.CONF / "budget" / "maze_fqi.yaml").read_text()
     (tmp_path / "budget" / "low_maze_fqi.yaml").write_text(budget)
     (low_maze,) = plans("env=low_maze", "curriculum=on", config_dir=str(tmp_path))
     assert low_maze.directory == Path("runs/quick/low_maze/C-FQI")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bcrl.common.identity import identity
-from bcrl.config import shell, vetting
+from bcrl.config import flags, jobs
 from bcrl.config.hydra_compose import CONF
 from bcrl.errors import BcrlError
 from bcrl.run import locks, records, runner
@@ -30,7 +30,7 @@ def everything(folder: Path) -> list[str]:
 
 
 def test_the_help_names_every_group_option_and_flag_on_a_screen():
-    text = shell.manual(None)
+    text = flags.manual(None)
     assert len(text.splitlines()) <= 62 and max(map(len, text.splitlines())) <= 92
     for path in CONF.glob("*/*.yaml"):
         if path.parent.name not in ("budget", "tuned", "local"):
@@ -44,7 +44,7 @@ def test_the_help_names_every_group_option_and_flag_on_a_screen():
 
 EXAMPLES = [
     line.strip()
-    for line in shell.manual(None)
+    for line in flags.manual(None)
     .partition("\nExamples\n")[2]
     .split("\n\n")[0]
     .split("\n")
@@ -59,9 +59,9 @@ def test_there_are_examples():
 def test_every_example_of_the_help_would_run(line, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = [*shlex.split(line)[1:], "--dry-run"]
-    asked = shell.parser().parse_intermixed_args(words)
+    asked = flags.parser().parse_intermixed_args(words)
     assert asked.dry_run
-    assert "nothing was run or written" in overview.dry_run(vetting.plans(asked))
+    assert "nothing was run or written" in overview.dry_run(jobs.plans(asked))
     assert everything(tmp_path) == []
 
 
@@ -77,8 +77,8 @@ def test_a_reader_may_leave_before_the_end(tmp_path):
 def test_a_users_options_are_in_the_help(tmp_path):
     (tmp_path / "env").mkdir()
     (tmp_path / "env" / "my_maze.yaml").write_text("name: maze\n")
-    assert "my_maze" in shell.manual(str(tmp_path))
-    assert "my_maze" not in shell.manual(None).partition("Your own")[0]
+    assert "my_maze" in flags.manual(str(tmp_path))
+    assert "my_maze" not in flags.manual(None).partition("Your own")[0]
 
 
 def test_help_and_tab_import_nothing_large(tmp_path):
@@ -332,12 +332,12 @@ def test_the_users_folder_is_found_and_named_in_what_is_recorded(
     os.rename(mine, tmp_path / "bcrl")
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     monkeypatch.setattr(sys, "argv", ["bcrl", "env=maze", "-m"])
-    (p,) = vetting.plans(shell.arguments())
+    (p,) = jobs.plans(flags.arguments())
     assert p.root == Path("elsewhere")
-    asked = shell.arguments()
+    asked = flags.arguments()
     assert asked.flags == ["-m", f"--config-dir={tmp_path / 'bcrl'}"]
     monkeypatch.setattr(sys, "argv", ["bcrl", "env=maze", "--config-dir=other"])
-    assert shell.arguments().config_dir == os.path.abspath("other")
+    assert flags.arguments().config_dir == os.path.abspath("other")
 
 
 # --- "did you mean" ---
@@ -353,5 +353,5 @@ def test_the_users_folder_is_found_and_named_in_what_is_recorded(
 def test_an_unknown_flag_is_named(line, said, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["bcrl", *line.split()])
     with pytest.raises(BcrlError) as refusal:
-        shell.arguments()
+        flags.arguments()
     assert str(refusal.value) == said

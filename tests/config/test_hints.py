@@ -9,7 +9,7 @@ import time
 import pytest
 
 from bcrl import cli
-from bcrl.config import guard, shell, vetting
+from bcrl.config import flags, hydra_compose, jobs
 from bcrl.errors import BcrlError
 from bcrl.report import cli as report
 from bcrl.report import verify
@@ -82,7 +82,7 @@ WRONG = [
     (MAZE, "algorithm.regressor=tabular", "algorithm/regressor=tabular"),
     (MAZE, "regressor=tabular", "algorithm/regressor=tabular"),
     ("-m " + MAZE, "hydra.launcher=slurm", "hydra/launcher=slurm"),
-    ("-m " + MAZE, "launcher=local", "hydra/launcher=local"),
+    ("-m " + MAZE, "launcher=local", "workers=2"),
     ("", "+experiment=fig1", "experiment=fig1"),
     (
         CART,
@@ -150,7 +150,7 @@ def asked(line: str, monkeypatch) -> str:
     """What `bcrl LINE --dry-run` shows; BcrlError as the command has it."""
     words = ["bcrl", *shlex.split(line), "--dry-run"]
     monkeypatch.setattr(sys, "argv", words)
-    return status.dry_run(vetting.plans(shell.arguments()))
+    return status.dry_run(jobs.plans(flags.arguments()))
 
 
 def test_there_are_many():
@@ -297,7 +297,7 @@ def test_what_is_no_text_is_no_name():
 
 
 def test_a_command_has_one_time(monkeypatch, tmp_path):
-    monkeypatch.delenv(guard.STARTED, raising=False)
+    monkeypatch.delenv(hydra_compose.STARTED, raising=False)
     (tmp_path / "local").mkdir()
     text = "# @package _global_\nruns_dir: out/${now:%H-%M-%S.%f}\n"
     (tmp_path / "local" / "default.yaml").write_text(text)
@@ -435,7 +435,7 @@ def test_all_three_name_the_results_alike(form, tmp_path, monkeypatch, capsys):
     if "runs_dir=../" in form and "--" in form:
         return
     monkeypatch.setattr(sys, "argv", ["bcrl", MAZE, *words])
-    (made,) = vetting.plans(shell.arguments())
+    (made,) = jobs.plans(flags.arguments())
     assert made.root == tmp_path / "none"
 
 

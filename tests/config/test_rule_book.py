@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from bcrl import api
+from bcrl.config import jobs
 from bcrl.config import plan as compose
-from bcrl.config import vetting
 from bcrl.config.hydra_compose import CONFIG_NAME, composed
 from bcrl.errors import ConfigError
 from bcrl.learning.curriculum import CURRICULA
@@ -33,7 +33,7 @@ from tests.toys import OpenCorridor
 
 def options(group: str) -> dict[str, dict]:
     """The options of a group, by name, as their files say."""
-    paths = sorted((vetting.CONF / group).glob("*.yaml"))
+    paths = sorted((jobs.CONF / group).glob("*.yaml"))
     return {path.stem: yaml.safe_load(path.read_text()) for path in paths}
 
 
@@ -49,8 +49,8 @@ OWN = {
 
 def settled(env: str, algorithm: str) -> dict:
     """A composed config of the pair, resolved."""
-    named = ("env.id=CartPole-v1",) if env == vetting.OPEN else ()
-    return vetting._plain(
+    named = ("env.id=CartPole-v1",) if env == jobs.OPEN else ()
+    return jobs._plain(
         composed(CONFIG_NAME, (f"env={env}", f"algorithm={algorithm}", *named), ())
     )
 

@@ -11,7 +11,7 @@ import pytest
 from gymnasium import spaces
 
 from bcrl.api import DQN, FQI, Forest, Gymnasium, run, stages
-from bcrl.config import vetting
+from bcrl.config import jobs
 from bcrl.envs import Success
 from bcrl.envs._contract import Simulator
 from bcrl.errors import BcrlError
@@ -121,7 +121,7 @@ REFUSED = {
 def test_what_breaks_the_contract_is_refused_before_work(cls, tmp_path):
     name = f"odd/{cls.__name__}-v0"
     with pytest.raises(BcrlError) as refused:
-        vetting.plans(arguments(*SMALL, f"env.id={name}", f"runs_dir={tmp_path}/runs"))
+        jobs.plans(arguments(*SMALL, f"env.id={name}", f"runs_dir={tmp_path}/runs"))
     text = str(refused.value)
     assert text.startswith(f"env.id={name}: ") and "\n" not in text
     for part in REFUSED[cls]:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from bcrl.config import jobs
 from bcrl.config import plan as compose
-from bcrl.config import vetting
 from bcrl.errors import BcrlError
 from bcrl.run import runner
 from bcrl.run.workers import cores
@@ -119,9 +119,9 @@ def test_a_part_that_is_none_is_refused(part):
 @pytest.mark.parametrize("name", ["local", "slurm"])
 def test_launchers_take_a_sweeps_jobs_and_no_commands(name):
     launcher = f"hydra/launcher={name}"
-    assert vetting.left_to_hydra(arguments(MAZE, launcher, multirun=True))
+    assert jobs.left_to_hydra(arguments(MAZE, launcher, multirun=True))
     with pytest.raises(BcrlError, match="add -m"):
-        vetting.left_to_hydra(arguments(MAZE, launcher))
+        jobs.left_to_hydra(arguments(MAZE, launcher))
     for harm in (
         "+hydra.launcher.setup=[x]",
         "+hydra.launcher.srun_args=[x]",

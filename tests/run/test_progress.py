@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bcrl.config import vetting
+from bcrl.config import jobs
 from bcrl.errors import BcrlError
 from bcrl.run import costs, runner
 from bcrl.run.progress import SILENCE, TRUST, Job, Progress, Tick
@@ -27,12 +27,12 @@ def test_a_sweep_over_experiments_is_all_of_their_jobs():
 def test_hydras_own_launchers_get_one_experiment_at_a_time():
     given = arguments("experiment=fig1,fig2", "hydra.sweep.dir=x", multirun=True)
     with pytest.raises(BcrlError, match="one at a time"):
-        vetting.left_to_hydra(given)
+        jobs.left_to_hydra(given)
 
 
 def test_who_runs_the_jobs_is_read_from_the_composed_config(tmp_path):
-    assert not vetting.left_to_hydra(arguments("experiment=fig2", multirun=True))
-    assert vetting.left_to_hydra(
+    assert not jobs.left_to_hydra(arguments("experiment=fig2", multirun=True))
+    assert jobs.left_to_hydra(
         arguments("env=maze", "+hydra.job.env_set.OMP_NUM_THREADS=1")
     )
     (tmp_path / "experiment").mkdir()
@@ -40,7 +40,7 @@ def test_who_runs_the_jobs_is_read_from_the_composed_config(tmp_path):
     own = f"# @package _global_\nhydra: {{callbacks: {{mine: {{_target_: {log}}}}}}}\n"
     (tmp_path / "experiment/own.yaml").write_text(own)
     given = arguments("env=maze", "experiment=own", config_dir=str(tmp_path))
-    assert vetting.left_to_hydra(given)
+    assert jobs.left_to_hydra(given)
 
 
 def test_plans_in_one_pool_write_what_they_write_alone(tmp_path):
