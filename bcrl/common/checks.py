@@ -11,6 +11,9 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from bcrl.errors import ConfigError, did_you_mean
 
+#: What a type is called in a message.
+NOUNS = {int: "an integer", float: "a number", str: "text", bool: "true or false"}
+
 
 def one_of(key: str, value: object, allowed: Sequence[str]) -> None:
     """Raise ConfigError unless `value` is one of `allowed`."""
@@ -37,7 +40,8 @@ def construct(section: str, cls: type, values: Mapping[str, Any]) -> Any:
                 why = did_you_mean(str(value), map(str, get_args(hint)))
             else:
                 name = hint.__name__ if isinstance(hint, type) else hint
-                why = f"must be of type {str(name).replace('typing.', '')}"
+                kind = f"of type {str(name).replace('typing.', '')}"
+                why = f"must be {NOUNS.get(hint, kind)}"
             raise ConfigError(place, value, why) from None
     for key, field_ in fields.items():
         lacks = field_.default is field_.default_factory is dataclasses.MISSING

@@ -140,15 +140,15 @@ class Hints:
     def line(self, typed: str, value: str | None = None) -> str | None:
         """What to type for a key or a whole word, which may have its value."""
         key, equals, given = typed.lstrip("+~-").partition("=")
-        value = given if equals else value
+        text = given if equals else value
         norm = re.sub(r"[\s-]", "_", key.strip().lower())
-        if value is None:
+        if text is None:
             return WORDS.get(norm) or self._word(key.strip())
-        for name in (KEYS.get(norm, norm), norm):
-            if found := self.spellings.get(name.replace("/", ".")):
-                return self._with(found, value.strip())
-        near = closest(norm, self.spellings, 0.6)
-        return self._with(self.spellings[near], value.strip()) if near else None
+        spelled = self.spellings
+        forms = [name.replace("/", ".") for name in (KEYS.get(norm, norm), norm)]
+        near = next((form for form in forms if form in spelled), None)
+        near = near or closest(norm, spelled, 0.6)
+        return self._with(spelled[near], text.strip()) if near else None
 
     def _with(self, key: str, value: str) -> str:
         """The key with its value, and before it the option that brings the key."""
@@ -161,7 +161,7 @@ class Hints:
             return numbers(key, value)
         option = "" if key in self.present else f"{self.brought[key]} "
         usual = self.present.get(key, "…")  # where none was typed
-        value = value or {None: "null", "???": "…"}.get(usual, usual)
+        value = value or str({None: "null", "???": "…"}.get(usual, usual))
         return f"{option}{key}={value}"
 
     def _word(self, word: str) -> str | None:
@@ -199,15 +199,12 @@ class Hints:
             why = f"{word!r} can't be read as KEY=VALUE"
             raise BcrlError(f"{why}; {self.mean(word, value)}")
         for override in parse(self.overrides):
-            key, value, typed = (
-                override.key_or_group,
-                override.value(),
-                override.input_line,
-            )
+            key, given = override.key_or_group, override.value()
+            typed = override.input_line
             raw = str(typed).partition("=")[2]
-            text = isinstance(value, RangeSweep | str) and not raw.startswith("${")
+            text = isinstance(given, RangeSweep | str) and not raw.startswith("${")
             habit = VALUES.get(key, {}) if key not in self.groups else {}
-            if (key in ("seed", "seeds") and text) or str(value).lower() in habit:
+            if (key in ("seed", "seeds") and text) or str(given).lower() in habit:
                 raise BcrlError(f"{typed}: did you mean {self._with(key, raw)}?")
 
     def swept(self) -> str:

@@ -133,7 +133,7 @@ def first_lines(error: BaseException) -> str:
 
 def options(group: str, folders: Paths = ()) -> list[str]:
     """The names of a group's options, ours and those of other folders."""
-    places = [Path(folder, group) for folder in (CONF, *folders)]
+    places = [folder / group for folder in (CONF, *map(Path, folders))]
     return sorted(
         {path.stem for place in places for path in place.glob("*.yaml")}, key=str.lower
     )
@@ -142,7 +142,7 @@ def options(group: str, folders: Paths = ()) -> list[str]:
 def groups(folders: Paths = ()) -> list[str]:
     """The names of all groups, `env` and `algorithm/regressor` among them."""
     found = set()
-    for folder in map(Path, (CONF, *folders)):
+    for folder in (CONF, *map(Path, folders)):
         for path in (*folder.glob("*/*.yaml"), *folder.glob("*/*/*.yaml")):
             found.add(path.parent.relative_to(folder).as_posix())
     return sorted(found)
@@ -151,8 +151,8 @@ def groups(folders: Paths = ()) -> list[str]:
 @cache
 def read(group: str, name: str | None, folders: Paths = ()) -> dict[str, Any]:
     """What an option's file says; nothing if there is none that can be read."""
-    for folder in (CONF, *folders):
-        path = Path(folder, group, f"{name}.yaml")
+    for folder in (CONF, *map(Path, folders)):
+        path = folder / group / f"{name}.yaml"
         with contextlib.suppress(BcrlError):  # whoever chooses it gets the error
             safety.check_file(path)
             found = yaml.safe_load(path.read_text("utf-8"))

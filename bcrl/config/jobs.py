@@ -72,7 +72,7 @@ def plans(arguments: Namespace) -> list[Plan]:
             for words in _jobs(name, chosen, hints, multirun):
                 job = composed(name, tuple(words), folders)
                 safety.check(job, usual)
-                schema.check_launcher(plain(job.hydra.launcher))
+                schema.check_launcher(job.hydra.launcher and plain(job.hydra.launcher))
                 found.append(job)
     except Unknown as error:
         raise BcrlError(hints.explained(error)) from error

@@ -29,7 +29,7 @@ def parse(overrides: Sequence[str]) -> list[Override]:
         check_override(override)
         try:
             parsed += parser.parse_overrides([override])
-        except HydraException as error:
+        except (HydraException, ValueError) as error:  # a number of 5000 digits
             key, _, value = override.partition("=~")
             home = f"; did you mean {key}=$HOME{value}?" if value else ""
             text = f"{override!r} can't be read as KEY=VALUE{home}"

@@ -192,7 +192,9 @@ def _check_numbers(section: str, learner: FQI | DQN | LSPI) -> None:
         fits = isinstance(value, kind) and not isinstance(value, bool)
         if not fits or not least <= value <= most:
             noun = "an integer" if kind is Integral else "a number"
-            bounds = f"from {least} to {most}" if most < math.inf else f"from {least}"
+            bounds = (
+                f"from {least} to {most}" if most < math.inf else f"of at least {least}"
+            )
             raise ConfigError(f"{section}.{name}", value, f"must be {noun} {bounds}")
 
 

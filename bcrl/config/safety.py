@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
+from typing import Any
 
 import yaml
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
@@ -142,8 +143,7 @@ def check(composed: DictConfig, usual: DictConfig | None) -> None:
     `usual` is a config with Hydra's keys at their defaults, or None where nobody could
     have changed them.
     """
-    config = OmegaConf.to_container(composed, resolve=False)
-    assert isinstance(config, dict)
+    config: Any = OmegaConf.to_container(composed, resolve=False)
     hydra = flat(config.pop("hydra"))
     if usual is not None:
         known = flat(OmegaConf.to_container(usual.hydra, resolve=False))  # type: ignore

@@ -112,7 +112,7 @@ def check_written(package: str, config: DictConfig) -> None:
 def texts() -> frozenset[str]:
     """The keys that a schema declares as text, ours and those of Slurm's launcher."""
 
-    def of(cls: type, prefix: str) -> set[str]:
+    def of(cls: Any, prefix: str) -> set[str]:
         hints = get_type_hints(cls)
         own = {prefix + name for name, hint in hints.items() if _is_text(hint)}
         inner = [(n, h) for n, h in hints.items() if dataclasses.is_dataclass(h)]
@@ -144,7 +144,8 @@ def check_launcher(values: Plain | None) -> None:
     if values == BASIC:
         return
     if values.get("_target_") != SlurmQueueConf._target_:
-        why = "can't be instantiated; hydra/launcher=slurm is the only launcher"
+        why = "can't be instantiated; hydra/launcher=slurm, or workers=2 without a "
+        why += "launcher for two of this machine's cores"
         raise ConfigError("hydra.launcher._target_", values.get("_target_"), why)
     construct("hydra.launcher", _Slurm, values)
     for key, value in values.items():

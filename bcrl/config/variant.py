@@ -161,7 +161,7 @@ def _curriculum(name: object) -> Callable[[int], list[int]]:
             raise ConfigError("curriculum.name", name, "must be a function")
         return found
     one_of("curriculum.name", name, list(CURRICULA))
-    return CURRICULA[name]
+    return CURRICULA[str(name)]
 
 
 def _option(name: str, chosen: object) -> str:
