@@ -126,30 +126,28 @@ def _check_overrides(overrides: Sequence[Override], hints: Hints) -> None:
     """Raise BcrlError for what Hydra would take without a word, or trip over."""
     asked = [o.get_key_element() for o in overrides if o.key_or_group[:5] == "hydra"]
     for override in overrides:
-        key, typed = override.key_or_group, override.input_line
+        key, typed, value = override.key_or_group, override.input_line, override.value()
+        group, named = key.replace(".", "/"), isinstance(value, str | Sweep)
+        why = ""
         if asked.count(override.get_key_element()) > 1:
-            raise BcrlError(f"{key}: given twice; Hydra would merge the values")
-        if override.is_delete() and key in VARIANT_GROUPS:
-            raise BcrlError(f"{key}: every run needs a choice of it")
-        if override.is_delete() and key in schema.Config.__annotations__:
-            raise BcrlError(f"~{key}: can't be deleted; leave it out for its default")
-        if key == "tuned":
-            raise BcrlError(f"{key}: follows from the other choices; override its keys")
-        value = override.value()
-        named = isinstance(value, (str, Sweep))
-        if key in (*VARIANT_GROUPS, *OPTIONAL, "variant") and not named:
+            why = "given twice; Hydra would merge the values"
+        elif override.is_delete() and key in schema.Config.__annotations__:
+            why = "can't be deleted: every run needs a choice of it, or its default"
+        elif key == "tuned":
+            why = "follows from the other choices; override its keys"
+        elif key == "experiment" and isinstance(value, list):
+            why = "one at a time, or -m experiment=fig1,fig2"
+        elif key in (*VARIANT_GROUPS, *OPTIONAL, "variant") and not named:
             why = f"name an option, or leave {key} out; {hints.of_option(key, value)}"
-            raise BcrlError(f"{typed}: {why}")
-        group = key.replace(".", "/")
-        if group != key and group in hints.groups and isinstance(value, str):
-            raise BcrlError(f"{typed}: an option is chosen by {group}={value}")
-        if key == "experiment" and isinstance(value, list):
-            raise BcrlError("experiment: one at a time, or -m experiment=fig1,fig2")
-        if key in OPTIONAL:
+        elif group != key and group in hints.groups and isinstance(value, str):
+            why = f"an option is chosen by {group}={value}"
+        elif key in OPTIONAL:
             swept = override.is_sweep_override()
             for name in override.sweep_string_iterator() if swept else [value]:
                 if name not in options(key, hints.folders):
-                    raise BcrlError(f"{key}={name}: {hints.of_option(key, name)}")
+                    typed, why = f"{key}={name}", hints.of_option(key, name)
+        if why:
+            raise BcrlError(f"{typed}: {why}")
 
 
 def _jobs(
@@ -194,13 +192,14 @@ def _plan(
     if env == OPEN:
         named = [f"env.id='{config['env']['id']}'"]
         env = str(config["env"]["id"]).rpartition(":")[2].replace("/", "-")
-    known: dict[str | None, Plain] = {}
-    for tag in (None, RELEASED):
-        usual = _usual(config, choices, tag == RELEASED)
-        if not folders and _is_usual(hydra, usual):
-            known[tag] = config
-            break
-        words = [f"{group}={option}" for group, option in usual.items()]
+    usual = {tag: _usual(config, choices, tag == RELEASED) for tag in (None, RELEASED)}
+    known: dict[str | None, Plain] = {
+        tag: config
+        for tag, chosen in usual.items()
+        if not folders and _is_usual(hydra, chosen)
+    }
+    for tag, chosen in usual.items() if not known else ():
+        words = [f"{group}={option}" for group, option in chosen.items()]
         words = [f"env={choices['env']}", "local=none", *named, *words]
         known[tag] = _plain(composed(CONFIG_NAME, tuple(words), folders))
         if not differences(config, known[tag]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import re
 from pathlib import Path
@@ -39,6 +40,9 @@ ALLOWED = re.compile(
 )
 
 
+_OURS: dict[str, ConfigResult] = {}
+
+
 class Rejected(BcrlError, CompactHydraException):
     """Bad input that Hydra, too, reports without a traceback."""
 
@@ -56,8 +60,11 @@ class Files(FileConfigSource):
         name = os.path.normpath(self._normalize_file_name(config_path))
         if os.path.isabs(name) or name.startswith(".."):
             raise Rejected(f"{config_path}: leads out of the folder {self.path}")
-        if self.provider == "main":
-            return super().load_config(config_path)
+        if self.provider == "main":  # ours, which every job of a sweep reads
+            place = os.path.join(self.path, name)
+            if place not in _OURS:
+                _OURS[place] = super().load_config(config_path)
+            return copy.deepcopy(_OURS[place])
         check_file(Path(self.path, name))
         loaded = super().load_config(config_path)
         package = loaded.header.get("package") or os.path.dirname(name)

@@ -287,7 +287,7 @@ def test_an_id_of_the_command_names_the_folder():
 BAD = {
     "no id": ([], "env.id"),
     "a misspelt id": (["env.id=CartPol-v1"], "did you mean CartPole-v1?"),
-    "a foreign module": (["env.id=os:CartPole-v1"], "BCRL_TRUST=os"),
+    "a foreign module": (["env.id=no_such:CartPole-v1"], "can't be imported"),
     "continuous actions": (["env.id=Pendulum-v1"], "{name: DiscretizeAction"),
     "no horizon": (["env.id=tests/Endless-v0"], "env.horizon"),
     "an unknown argument": (["env.kwargs={prise: 2.0}"], "did you mean prize?"),
@@ -311,7 +311,7 @@ BAD = {
         ["env.wrappers=[{name: StickyAction, prob: 0.1}]"],
         "repeat_action_probability",
     ),
-    "an untrusted map": (["env.observation=os.getcwd"], "BCRL_TRUST=os"),
+    "an untrusted map": (["env.observation=os.nope"], "os has no nope"),
     "success": (["env.success=survive"], "did you mean survived?"),
     "no starts": (["env.starts=0"], "env.starts"),
     "two kinds of task": (

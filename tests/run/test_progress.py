@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from bcrl.config import jobs
 from bcrl.errors import BcrlError
 from bcrl.run import costs, runner
 from bcrl.run.progress import SILENCE, TRUST, Job, Progress, Tick
-from tests.conftest import arguments, plan, plans
+from tests.conftest import plan, plans
 
 FIGURES = ("experiment=fig1,fig2,fig4", "scale=paper", "workers=2")
 
@@ -24,23 +23,10 @@ def test_a_sweep_over_experiments_is_all_of_their_jobs():
     assert {p.directory for p in again} == {p.directory for p in again[:4]}
 
 
-def test_hydras_own_launchers_get_one_experiment_at_a_time():
-    given = arguments("experiment=fig1,fig2", "hydra.sweep.dir=x", multirun=True)
+def test_a_launcher_gets_one_experiment_at_a_time():
     with pytest.raises(BcrlError, match="one at a time"):
-        jobs.left_to_hydra(given)
-
-
-def test_who_runs_the_jobs_is_read_from_the_composed_config(tmp_path):
-    assert not jobs.left_to_hydra(arguments("experiment=fig2", multirun=True))
-    assert jobs.left_to_hydra(
-        arguments("env=maze", "+hydra.job.env_set.OMP_NUM_THREADS=1")
-    )
-    (tmp_path / "experiment").mkdir()
-    log = "hydra.experimental.callbacks.LogJobReturnCallback"
-    own = f"# @package _global_\nhydra: {{callbacks: {{mine: {{_target_: {log}}}}}}}\n"
-    (tmp_path / "experiment/own.yaml").write_text(own)
-    given = arguments("env=maze", "experiment=own", config_dir=str(tmp_path))
-    assert jobs.left_to_hydra(given)
+        plans("experiment=fig1,fig2", "hydra/launcher=slurm", multirun=True)
+    assert not any(made.launched for made in plans("experiment=fig2"))
 
 
 def test_plans_in_one_pool_write_what_they_write_alone(tmp_path):
@@ -140,12 +126,3 @@ def test_a_line_is_due_after_a_while_of_silence(monkeypatch, capsys):
     now[0] += SILENCE
     progress.tick(Tick(0, 1, 0, SILENCE))
     assert "step 0/10 · seed 0" in capsys.readouterr().err
-
-
-def test_hydra_runs_the_jobs_where_more_of_it_is_asked_for(bcrl, tmp_path):
-    small = ("scale=smoke", "seeds.count=1", "algorithm/regressor=tabular", "tag=t")
-    done = bcrl("-m", "env=maze", "curriculum=on,off", *small, "hydra.sweep.dir=here")
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "here/multirun.yaml").exists()
-    made = tmp_path.glob("runs/smoke/maze/*/seed_0000.csv")
-    assert sorted(p.parent.name for p in made) == ["C-FQI@t", "FQI@t"]
