@@ -25,15 +25,17 @@ from bcrl.learning.transfer import Boost, Shape, StageInit, warm_start
 from bcrl.q.functions import ZERO
 from bcrl.q.quadratic import FEATURES
 
+_COUNTS = (
+    *("iterations", "episodes", "steps", "target_update", "batch_size"),
+    *("evaluate_every", "evaluation_episodes"),
+)
+_STEPS = ("random_steps", "learning_starts", "anneal_steps")
+_PROBABILITIES = ("epsilon", "epsilon_start", "evaluation_epsilon")
 #: A setting's type, its least and its greatest value.
 BOUNDS = {
-    **dict.fromkeys(("iterations", "episodes", "steps"), (Integral, 1, math.inf)),
-    **dict.fromkeys(("random_steps", "learning_starts"), (Integral, 0, math.inf)),
-    **dict.fromkeys(("epsilon", "epsilon_start"), (Real, 0, 1)),
-    **dict.fromkeys(("anneal_steps",), (Integral, 0, math.inf)),
-    **dict.fromkeys(("target_update", "batch_size"), (Integral, 1, math.inf)),
-    **dict.fromkeys(("evaluate_every", "evaluation_episodes"), (Integral, 1, math.inf)),
-    **dict.fromkeys(("evaluation_epsilon",), (Real, 0, 1)),
+    **dict.fromkeys(_COUNTS, (Integral, 1, math.inf)),
+    **dict.fromkeys(_STEPS, (Integral, 0, math.inf)),
+    **dict.fromkeys(_PROBABILITIES, (Real, 0, 1)),
 }
 #: What a warm start passes on besides values, so that it can't differ between slots.
 PASSED_ON = {FQI: ("regressor",), DQN: ("hidden", "learning_rate")}
@@ -112,50 +114,53 @@ def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
 
 def _check_fqi(chosen: Composition, learner: FQI, env: Env, start: StageInit) -> None:
     _check_numbers("algorithm", learner)
-    key, regressor = "algorithm.regressor", learner.regressor
+    regressor, why = learner.regressor, ""
+    key: str = "algorithm.regressor"
+    value: Any = regressor
     if isinstance(regressor, type) or not hasattr(regressor, "fit"):
-        raise ConfigError(key, regressor, "is no regressor")
-    if not hasattr(regressor, "finite_only"):
+        why = "is no regressor"
+    elif not hasattr(regressor, "finite_only"):
         why = "is no regressor of bcrl's; Sklearn(estimator) makes one of it"
-        raise ConfigError(key, regressor, why)
-    if regressor.finite_only and not is_finite(env):
+    elif regressor.finite_only and not is_finite(env):
         why = f"needs finitely many states, which {env.name} has not"
-        raise chosen.error(key, regressor, why)
-    if learner.shared_data and learner.epsilon < 1:
+    elif learner.shared_data and learner.epsilon < 1:
+        key, value = "algorithm.dataset", "shared"
         why = "seeds can share data only if all are random: algorithm.epsilon must be 1"
-        raise ConfigError("algorithm.dataset", "shared", why)
-    if start.behavior is not None:
+    elif start.behavior is not None:
+        key, value = "transfer", chosen.transfer
         why = "steers step by step, FQI learns from whole episodes; use algorithm=dqn"
-        raise chosen.error("transfer", chosen.transfer, why)
-    if start.boost != Boost():
-        why = "is the released DQN's reading; FQI knows the paper's, boosting=on"
+    elif start.boost != Boost():
         key = "boosting" if chosen.boost else "transfer"
-        raise chosen.error(key, chosen.boost or chosen.transfer, why)
-    if start.shape not in (None, Shape()):
+        value = chosen.boost or chosen.transfer
+        why = "is the released DQN's reading; FQI knows the paper's, boosting=on"
+    elif start.shape not in (None, Shape()):
+        key, value = "transfer", chosen.transfer
         why = "is the released DQN's reading; FQI knows transfer=shaping"
-        raise chosen.error("transfer", chosen.transfer, why)
+    if why:
+        raise chosen.error(key, value, why)
 
 
 def _check_dqn(chosen: Composition, learner: DQN, start: StageInit) -> None:
     _check_numbers("algorithm", learner)
-    size, begins = learner.replay_size, learner.learning_starts
+    size, widths, why = learner.replay_size, learner.hidden, ""
+    key: str = "algorithm.replay_size"
+    value: Any = size
     if not isinstance(size, Integral) or size < learner.batch_size:
         why = f"holds less than a batch, batch_size={learner.batch_size}"
-        raise ConfigError("algorithm.replay_size", size, why)
-    if size <= begins:
-        why = f"never holds more than learning_starts={begins}, so nothing is learned"
-        raise ConfigError("algorithm.replay_size", size, why)
-    if not 0 < learner.learning_rate < math.inf:
+    elif size <= learner.learning_starts:
+        why = f"never holds more than learning_starts={learner.learning_starts}"
+    elif not 0 < learner.learning_rate < math.inf:
+        key, value = "algorithm.learning_rate", learner.learning_rate
         why = "must be a number above 0"
-        raise ConfigError("algorithm.learning_rate", learner.learning_rate, why)
-    widths = learner.hidden
-    whole = all(isinstance(w, Integral) and w >= 1 for w in widths)
-    if not widths or not whole:
+    elif not widths or not all(isinstance(w, Integral) and w >= 1 for w in widths):
+        key, value = "algorithm.hidden", list(widths)
         why = "must be a list of layer widths, each at least 1"
-        raise ConfigError("algorithm.hidden", list(widths), why)
-    if start.initial is not ZERO and chosen.transfers != (warm_start,):
+    elif start.initial is not ZERO and chosen.transfers != (warm_start,):
+        key, value = "transfer", chosen.transfer
         why = "sets `initial`, but DQN starts from networks: set `base`, `potential` "
-        raise chosen.error("transfer", chosen.transfer, why + "or `prior`")
+        why += "or `prior`"
+    if why:
+        raise chosen.error(key, value, why)
 
 
 def _check_slot_of_lspi(
@@ -192,9 +197,8 @@ def _check_numbers(section: str, learner: FQI | DQN | LSPI) -> None:
         fits = isinstance(value, kind) and not isinstance(value, bool)
         if not fits or not least <= value <= most:
             noun = "an integer" if kind is Integral else "a number"
-            bounds = (
-                f"from {least} to {most}" if most < math.inf else f"of at least {least}"
-            )
+            upper = f"from {least} to {most}"
+            bounds = upper if most < math.inf else f"of at least {least}"
             raise ConfigError(f"{section}.{name}", value, f"must be {noun} {bounds}")
 
 
