@@ -1,6 +1,6 @@
 """The `bcrl` command: plans what a command line asks for, and runs it in one pool.
 
-What takes long to import is imported where it is needed: Tab and --help don't wait.
+Slow imports are made where they are needed, so that Tab and --help don't wait.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from bcrl.common.files import make_directory
 from bcrl.common.signals import EXIT_CODE, Interrupted, heard
 from bcrl.common.terminal import ready, say, show
 from bcrl.config import flags
-from bcrl.config.hydra_compose import CONF, CONFIG_NAME, register, searchpath
+from bcrl.config.hydra_compose import CONF, CONFIG_NAME, register_plugins, searchpath
 from bcrl.errors import BcrlError
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def _run_job(composed: DictConfig) -> int:
 
 def _by_hydra(asked: Namespace) -> None:
     """Have Hydra show something, or launch jobs."""
-    register()
+    register_plugins()
     folders = searchpath(getattr(asked, "folders", ()))
     sys.argv[1:] = [*flags.for_hydra(asked), *asked.overrides, *folders]
     # Not a decorator: a launcher's process looks for the plain function by its name.

@@ -41,7 +41,7 @@ class Timed:
 
 
 def main(every: str = "60") -> None:
-    schema.register()
+    schema.register_schema()
     print(f"{'':14}{'run, s':>8}{'written':>9}{'MiB':>8}{'ms each':>9}{'share':>8}")
     for name, choice in CHOICES.items():
         with tempfile.TemporaryDirectory() as folder:

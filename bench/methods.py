@@ -81,7 +81,7 @@ def multiplying() -> float:
 
 
 def main() -> None:
-    schema.register()
+    schema.register_schema()
     torch.set_num_threads(1)
     print(
         f"this core multiplies (32, 128) by (128, 128) at {multiplying():.0f} GFLOP/s"

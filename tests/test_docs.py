@@ -30,7 +30,7 @@ COMMANDS = [(page.name, line) for page in PAGES for line in commands(page)]
 def test_every_command_would_run(page, line, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = shlex.split(line, comments=True)[1:]
-    asked = flags.parser().parse_intermixed_args(words)
+    asked = flags.flag_parser().parse_intermixed_args(words)
     if not asked.status:
         assert "nothing was run" in overview.dry_run(jobs.plans(asked))
 

@@ -11,7 +11,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from bcrl.errors import ConfigError, did_you_mean
 
-#: What a type is called in a message.
+#: The words for a type in a message.
 NOUNS = {int: "an integer", float: "a number", str: "text", bool: "true or false"}
 
 

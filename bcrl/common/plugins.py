@@ -28,7 +28,7 @@ NAMING = (
 )
 
 
-def named(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def named_code(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """The keys of a config that name code of the user's, each with the name."""
     values = flat(dict(config))
     for key in NAMING:
@@ -83,7 +83,7 @@ def module(key: str, name: str, where: str, known: Collection[str] = ()) -> Modu
 
 def fingerprint(config: Mapping[str, Any]) -> str:
     """A digest of the sources of the user's packages that a config names, or ""."""
-    packages = {re.split("[.:]", name)[0] for _, name in named(config)} - {"bcrl"}
+    packages = {re.split("[.:]", name)[0] for _, name in named_code(config)} - {"bcrl"}
     digest = hashlib.sha256()
     for package in sorted(packages):
         spec = importlib.util.find_spec(package)

@@ -13,7 +13,7 @@ from pathlib import PurePath
 
 from hydra.core.override_parser.types import ChoiceSweep, Glob
 
-from bcrl.config.hydra_compose import Paths, groups, now, options
+from bcrl.config.hydra_compose import Paths, group_names, now, options
 from bcrl.config.overrides import parse
 from bcrl.config.schema import NAME, section_of_seeds, texts
 from bcrl.errors import ConfigError
@@ -49,7 +49,7 @@ def _canonical(text: str, folders: Paths) -> Iterator[str]:
     (override,) = parse([text])
     key, value = override.key_or_group, override.value()
     head, equals, raw = text.partition("=")
-    is_group = key in groups(folders)
+    is_group = key in group_names(folders)
     if override.is_delete() or not equals:
         yield text
     elif key in ("seed", "seeds") or (key == "seeds.only" and value is not None):

@@ -19,7 +19,13 @@ from omegaconf import OmegaConf
 from bcrl import __version__
 from bcrl.common.files import user_folder
 from bcrl.common.identity import flat
-from bcrl.config.hydra_compose import CONFIG_NAME, PACKAGE, composed, groups, options
+from bcrl.config.hydra_compose import (
+    CONFIG_NAME,
+    PACKAGE,
+    composed,
+    group_names,
+    options,
+)
 from bcrl.config.safety import check_override
 from bcrl.errors import BcrlError, closest
 
@@ -35,7 +41,7 @@ def arguments() -> Namespace:
     If no folder of configs is named, it is ~/.config/bcrl where that exists;
     `unnamed` says so.
     """
-    flags, words = parser(), sys.argv[1:]
+    flags, words = flag_parser(), sys.argv[1:]
     for place, word in enumerate(takewhile(lambda word: word != "--", words)):
         check_override(word)
         if word.startswith("-") and not _is_flag(word, flags):
@@ -53,7 +59,7 @@ def arguments() -> Namespace:
 def for_hydra(asked: Namespace) -> list[str]:
     """The flags that Hydra is given."""
     given = []
-    for action in parser()._actions:
+    for action in flag_parser()._actions:
         value = getattr(asked, action.dest, None)
         if value and action.dest not in _OURS:
             longest = max(action.option_strings, key=len)
@@ -61,7 +67,7 @@ def for_hydra(asked: Namespace) -> list[str]:
     return given
 
 
-def parser() -> argparse.ArgumentParser:
+def flag_parser() -> argparse.ArgumentParser:
     """Hydra's flags and ours."""
     result = get_args_parser()
     result.prog = "bcrl"
@@ -117,7 +123,7 @@ def own_folder() -> Path | None:
 
 
 def short() -> str:
-    """What `bcrl` alone shows: what it is, examples, and where more is said."""
+    """What `bcrl` alone shows: what it is, examples, and where to read more."""
     title, _, rest = manual(None).partition("\n")
     examples = rest.partition("\nExamples\n")[2].partition("\n\n")[0]
     return f"{title}\n\n{examples}\n\nbcrl --help shows groups, keys, flags and more."
@@ -141,7 +147,7 @@ def completions(line: str) -> list[str]:
     """What a line's last word may become: a flag, an option, a group or a key."""
     words = line.split()[1:]
     word = words.pop() if words and not line[-1].isspace() else ""
-    flags = parser()
+    flags = flag_parser()
     if word.startswith("-"):
         return sorted(name for name in _names(flags) if name.startswith(word))
     try:
@@ -156,7 +162,9 @@ def completions(line: str) -> list[str]:
     chosen = any(o.startswith(("env=", "experiment=")) for o in typed.overrides)
     # Without an env nothing composes; most keys are the same in all of them.
     asked = (*["env=maze"] * (not chosen), *typed.overrides)
-    known = {group: None for group in groups(folders) if not group.startswith("tuned")}
+    known = {
+        group: None for group in group_names(folders) if not group.startswith("tuned")
+    }
     try:
         job = OmegaConf.to_container(composed(CONFIG_NAME, asked, folders))
         known |= {k: v for k, v in flat(job).items() if not k.startswith("hydra.")}  # type: ignore

@@ -20,16 +20,16 @@ from bcrl.config.hydra_compose import (
     Paths,
     Unknown,
     composed,
-    groups,
+    group_names,
     options,
-    read,
+    read_option,
 )
 from bcrl.config.overrides import parse
 from bcrl.config.safety import check_override
 from bcrl.errors import BcrlError, closest
 
 #: Other tools' words for our keys.
-_KEYS = {
+_TABLE = {
     "algorithm.learning_rate": "lr alpha step_size",
     "env.gamma": "discount gamma",
     "algorithm.regressor.trees": "n_estimators n_trees",
@@ -74,17 +74,24 @@ _WORDS = {
     "workers=2": "local joblib",
     "logger=tensorboard": "tensorboard",
 }
-KEYS = {word: ours for ours, words in _KEYS.items() for word in words.split()}
-WORDS = {word: ours for ours, words in _WORDS.items() for word in words.split()}
+_ALIASES = {word: ours for ours, words in _TABLE.items() for word in words.split()}
+_FLAGS = {word: ours for ours, words in _WORDS.items() for word in words.split()}
 #: Other words for values: those of a key, those of any group.
-VALUES = {
+_VALUES = {
     "device": {"gpu": "cuda", "true": "cuda", "yes": "cuda", "1": "cuda", "mps": "cpu"},
     "progress": {"false": "none", "off": "none", "true": "bar", "on": "bar"},
     "variant": {"fqi": "plain", "dqn": "plain", "none": "plain", "off": "plain"},
 }
 #: The groups whose options have keys of their own.
-SECTIONS = ("env", "algorithm", "algorithm/regressor", "boosting", "transfer", "logger")
-YES, NO = ("true", "yes", "1", "on"), ("false", "no", "0", "off", "none", "null")
+_SECTIONS = (
+    "env",
+    "algorithm",
+    "algorithm/regressor",
+    "boosting",
+    "transfer",
+    "logger",
+)
+_YES, _NO = ("true", "yes", "1", "on"), ("false", "no", "0", "off", "none", "null")
 
 
 @dataclass(frozen=True)
@@ -97,7 +104,9 @@ class Hints:
     @cached_property
     def groups(self) -> dict[str, list[str]]:
         """The options of each group."""
-        found = {name: options(name, self.folders) for name in groups(self.folders)}
+        found = {
+            name: options(name, self.folders) for name in group_names(self.folders)
+        }
         return found | {"hydra/launcher": ["slurm"], "hydra/sweeper": ["basic"]}
 
     @cached_property
@@ -116,9 +125,9 @@ class Hints:
     def brought(self) -> dict[str, str]:
         """The keys that options bring into their section, and the first such option."""
         found: dict[str, str] = {}
-        for group in SECTIONS:
+        for group in _SECTIONS:
             for name in self.groups[group]:
-                for key in flat(read(group, name, self.folders)):
+                for key in flat(read_option(group, name, self.folders)):
                     whole = f"{group.replace('/', '.')}.{key}"
                     found.setdefault(whole, f"{group}={name}")
         return found
@@ -143,9 +152,9 @@ class Hints:
         text = given if equals else value
         norm = re.sub(r"[\s-]", "_", key.strip().lower())
         if text is None:
-            return WORDS.get(norm) or self._word(key.strip())
+            return _FLAGS.get(norm) or self._word(key.strip())
         spelled = self.spellings
-        forms = [name.replace("/", ".") for name in (KEYS.get(norm, norm), norm)]
+        forms = [name.replace("/", ".") for name in (_ALIASES.get(norm, norm), norm)]
         near = next((form for form in forms if form in spelled), None)
         near = near or closest(norm, spelled, 0.6)
         return self._with(spelled[near], text.strip()) if near else None
@@ -156,7 +165,7 @@ class Hints:
             return ours
         if key in self.groups:
             return self._choice(key, value) or f"{key}={value or '…'}"
-        value = VALUES.get(key, {}).get(value.lower(), value)
+        value = _VALUES.get(key, {}).get(value.lower(), value)
         if key in ("seeds", "seed"):
             return numbers(key, value)
         option = "" if key in self.present else f"{self.brought[key]} "
@@ -181,10 +190,10 @@ class Hints:
         whole = str(value).strip("'\"[] ").lower().replace("-", "_")
         if group == "hydra/launcher" and whole in ("local", "joblib", "submitit_local"):
             return "workers=2"
-        text = VALUES.get(group, {}).get(whole, whole)
+        text = _VALUES.get(group, {}).get(whole, whole)
         text = text.replace("figure", "fig").removesuffix("_fqi").removesuffix("_dqn")
         forms = [text, f"fig{text}"]
-        forms += ["on"] * (text in YES) + ["off", "none"] * (text in NO)
+        forms += ["on"] * (text in _YES) + ["off", "none"] * (text in _NO)
         forms += [name for name in known if len(text) > 2 and text in name]
         near = next((form for form in forms if form in known), None)
         near = near or closest(text, known, 0.5 if len(known) > 1 else 0.0)
@@ -203,7 +212,7 @@ class Hints:
             typed = override.input_line
             raw = str(typed).partition("=")[2]
             text = isinstance(given, RangeSweep | str) and not raw.startswith("${")
-            habit = VALUES.get(key, {}) if key not in self.groups else {}
+            habit = _VALUES.get(key, {}) if key not in self.groups else {}
             if (key in ("seed", "seeds") and text) or str(given).lower() in habit:
                 raise BcrlError(f"{typed}: did you mean {self._with(key, raw)}?")
 

@@ -27,7 +27,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 CONF = next(p for p in (PACKAGE / "conf", PACKAGE.parent / "conf") if p.is_dir())
 CONFIG_NAME = "config"
 STARTED = "BCRL_STARTED"  # when the command began, in its jobs' processes, too
-#: What Hydra says of a key that can't be overridden, added or deleted.
+#: Hydra's messages about a key that can't be overridden, added or deleted.
 UNKNOWN = re.compile(
     r"Could not override '([^']+)'|Could not append.* already at '([^']+)'"
     r"|Could not delete from config\. '([^']+)' does not exist"
@@ -52,10 +52,10 @@ def now(pattern: str) -> str:
     return datetime.fromtimestamp(began).strftime(pattern)
 
 
-def register() -> None:
+def register_plugins() -> None:
     """Make the schema known to Hydra, and how folders of configs are read."""
-    schema.register()
-    for plugin in (safety.Files, safety.Folders):
+    schema.register_schema()
+    for plugin in (safety.ConfigFolder, safety.OwnSearchPath):
         Plugins.instance().register(plugin)
     OmegaConf.register_new_resolver("now", now, replace=True)
 
@@ -63,17 +63,19 @@ def register() -> None:
 def searchpath(folders: Paths) -> list[str]:
     """The override that adds folders to Hydra's search path, if there are any."""
     quoted = [folder.replace("'", r"\'") for folder in folders]
-    places = ",".join(f"'{safety.Files.scheme()}://{folder}'" for folder in quoted)
+    places = ",".join(
+        f"'{safety.ConfigFolder.scheme()}://{folder}'" for folder in quoted
+    )
     return [f"hydra.searchpath=[{places}]"] if folders else []
 
 
 @cache
 def composed(name: str, overrides: tuple[str, ...], folders: Paths) -> DictConfig:
     """One job's config, composed from its overrides; BcrlError says what is wrong."""
-    register()
+    register_plugins()
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
-            register()  # once more: Hydra has a `now` of its own
+            register_plugins()  # once more: Hydra has a `now` of its own
             asked = [*overrides, *searchpath(folders)]
             return compose(name, asked, return_hydra_config=True)
     except BcrlError:
@@ -139,7 +141,7 @@ def options(group: str, folders: Paths = ()) -> list[str]:
     )
 
 
-def groups(folders: Paths = ()) -> list[str]:
+def group_names(folders: Paths = ()) -> list[str]:
     """The names of all groups, `env` and `algorithm/regressor` among them."""
     found = set()
     for folder in (CONF, *map(Path, folders)):
@@ -149,7 +151,7 @@ def groups(folders: Paths = ()) -> list[str]:
 
 
 @cache
-def read(group: str, name: str | None, folders: Paths = ()) -> dict[str, Any]:
+def read_option(group: str, name: str | None, folders: Paths = ()) -> dict[str, Any]:
     """What an option's file says; nothing if there is none that can be read."""
     for folder in (CONF, *map(Path, folders)):
         path = folder / group / f"{name}.yaml"

@@ -26,8 +26,8 @@ from bcrl.config.hydra_compose import (
     composed,
     options,
     plain,
-    read,
-    register,
+    read_option,
+    register_plugins,
 )
 from bcrl.config.overrides import experiments, over_experiments, parse, product
 from bcrl.config.plan import Plan
@@ -71,7 +71,7 @@ def plans(arguments: Namespace) -> list[Plan]:
         for chosen in experiments(parsed, multirun):
             for words in _jobs(name, chosen, hints, multirun):
                 job = composed(name, tuple(words), folders)
-                safety.check(job, usual)
+                safety.check_composed(job, usual)
                 schema.check_launcher(job.hydra.launcher and plain(job.hydra.launcher))
                 found.append(job)
     except Unknown as error:
@@ -94,8 +94,8 @@ def plan_of_job(config: DictConfig, hydra: DictConfig) -> Plan:
 
     The command that launched it has checked the config.
     """
-    register()
-    scheme = safety.Files.scheme()
+    register_plugins()
+    scheme = safety.ConfigFolder.scheme()
     folders = [s.path for s in hydra.runtime.config_sources if s.schema == scheme]
     extra = tuple(folder for folder in folders if Path(folder) != CONF)
     return _plan(config, hydra, extra, None)
@@ -185,7 +185,7 @@ def _plan(
         raise ConfigError("env.id", "???", "name an environment: env.id=CartPole-v1")
     _check_variant(choices, folders)
     config = _plain(job)
-    for key, name in plugins.named(config):
+    for key, name in plugins.named_code(config):
         if typed is None or any(_names(text, key, name) for text in typed):
             plugins.trust(name)
     env, named = choices["env"], list[str]()
@@ -241,7 +241,7 @@ def _check_variant(choices: Mapping[str, str], folders: Paths) -> None:
     name = choices.get("variant")
     means = {
         key.removeprefix("override /"): option
-        for entry in read("variant", name, folders).get("defaults", ())
+        for entry in read_option("variant", name, folders).get("defaults", ())
         for key, option in dict(entry).items()
     }
     for group, option in means.items():
@@ -280,7 +280,7 @@ def _is_usual(hydra: DictConfig, usual: Mapping[str, str]) -> bool:
     the job did.
     """
     choices = hydra.runtime.choices
-    experiment = read("experiment", choices.get("experiment"))
+    experiment = read_option("experiment", choices.get("experiment"))
     entries = experiment.get("defaults") or ()
     keys = [o.lstrip("+").partition("=")[0] for o in hydra.overrides.task]
     keys += [str(key).removeprefix("override /") for entry in entries for key in entry]

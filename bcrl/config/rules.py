@@ -37,7 +37,7 @@ BOUNDS = {
     **dict.fromkeys(_STEPS, (Integral, 0, math.inf)),
     **dict.fromkeys(_PROBABILITIES, (Real, 0, 1)),
 }
-#: What a warm start passes on besides values, so that it can't differ between slots.
+#: Settings that a warm start passes on, so that they can't differ between slots.
 PASSED_ON = {FQI: ("regressor",), DQN: ("hidden", "learning_rate")}
 
 

@@ -47,7 +47,7 @@ class Rejected(BcrlError, CompactHydraException):
     """Bad input that Hydra, too, reports without a traceback."""
 
 
-class Files(FileConfigSource):
+class ConfigFolder(FileConfigSource):
     """A folder of configs; those of the user's own are plain, small data within it."""
 
     @staticmethod
@@ -76,15 +76,15 @@ class Files(FileConfigSource):
         return loaded
 
 
-class Folders(SearchPathPlugin):
-    """Has our own configs read by `Files`, too, so that they lead nowhere else."""
+class OwnSearchPath(SearchPathPlugin):
+    """Has our own configs read as a `ConfigFolder`, too: they lead nowhere else."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         """Change the place of the main configs."""
         for place in search_path.get_path():
             if place.provider == "main":
                 path = (place.path or "").removeprefix("file://")
-                place.path = f"{Files.scheme()}://{path}"
+                place.path = f"{ConfigFolder.scheme()}://{path}"
 
 
 def check_override(text: str) -> None:
@@ -144,7 +144,7 @@ def check_yaml(text: str) -> None:
                 raise BcrlError(f"has a bare {word}, which YAML reads as {read}; {why}")
 
 
-def check(composed: DictConfig, usual: DictConfig | None) -> None:
+def check_composed(composed: DictConfig, usual: DictConfig | None) -> None:
     """Raise ConfigError for interpolations or keys of Hydra's that aren't allowed.
 
     `usual` is a config with Hydra's keys at their defaults, or None where nobody could

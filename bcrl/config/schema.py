@@ -20,7 +20,7 @@ from bcrl.errors import ConfigError, at_least
 
 
 @dataclass
-class Seeds:
+class SeedsSection:
     """Which seeds a command runs."""
 
     first: int = 0
@@ -57,7 +57,7 @@ class Config:
     boosting: Any = MISSING
     transfer: Any = MISSING
     scale: Scale = field(default_factory=Scale)
-    seeds: Seeds = field(default_factory=Seeds)
+    seeds: SeedsSection = field(default_factory=SeedsSection)
     workers: int = 1
     threads: int | None = None
     device: str = "cpu"
@@ -69,7 +69,7 @@ class Config:
     checkpoint_every: float = 60.0
 
 
-def register() -> None:
+def register_schema() -> None:
     """Make the schema known to Hydra as `schema`."""
     ConfigStore.instance().store(name="schema", node=Config)
 

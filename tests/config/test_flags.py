@@ -50,7 +50,7 @@ def test_every_example_of_the_help_would_run(tmp_path, monkeypatch):
     assert len(examples) >= 5
     for line in examples:
         words = shlex.split(line)
-        asked = flags.parser().parse_intermixed_args([*words[1:], "--dry-run"])
+        asked = flags.flag_parser().parse_intermixed_args([*words[1:], "--dry-run"])
         assert words[0] == "bcrl" and asked.dry_run
         assert "nothing was run or written" in overview.dry_run(jobs.plans(asked))
     assert everything(tmp_path) == []

@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 
 from bcrl import cli
 from bcrl.common.identity import flat
-from bcrl.config.hydra_compose import composed, groups, options
+from bcrl.config.hydra_compose import composed, group_names, options
 from bcrl.run import runner
 
 EXAMPLES = int(os.environ.get("BCRL_FUZZ", "90"))
@@ -95,7 +95,7 @@ def keys() -> list[str]:
 @cache
 def choices() -> list[str]:
     """Every choice there is, `env=maze` and the like."""
-    return [f"{group}={option}" for group in groups() for option in options(group)]
+    return [f"{group}={option}" for group in group_names() for option in options(group)]
 
 
 TEXT = st.text(st.one_of(st.characters(), st.characters(categories=["Cs"])), max_size=8)

@@ -15,7 +15,7 @@ from bcrl.learning.transfer import warm_start
 
 FAMILY = "DQN"
 LOCKSTEP = 20
-PER_SLOT = (
+_PER_SLOT = (
     *("learners", "steps", "epsilon", "epsilon_start", "anneal_steps"),
     *("target_update", "evaluate_every", "evaluation_episodes", "evaluation_epsilon"),
 )
@@ -29,7 +29,7 @@ def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
         raise ConfigError("algorithm.lspi", pretraining, "must be a section")
     check_lspi(construct("algorithm.lspi", LSPI, pretraining))
     learners: list[Learner] = []
-    for slot, own in enumerate(per_slot(settings, PER_SLOT, len(chosen.order))):
+    for slot, own in enumerate(per_slot(settings, _PER_SLOT, len(chosen.order))):
         kind = own.pop("learners", "auto")
         one_of("algorithm.learners", kind, ("auto", "dqn", "lspi"))
         dqn: DQN = construct("algorithm", DQN, own)

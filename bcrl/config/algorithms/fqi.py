@@ -16,7 +16,7 @@ from bcrl.q.regressors.ours import regressor_class
 
 FAMILY = "FQI"
 LOCKSTEP = 4
-PER_SLOT = ("iterations", "episodes", "epsilon")
+_PER_SLOT = ("iterations", "episodes", "epsilon")
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class _Settings:
 def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
     """One stage per slot, with the scale's caps on its budget."""
     learners = []
-    for values in per_slot(section, PER_SLOT, len(chosen.order)):
+    for values in per_slot(section, _PER_SLOT, len(chosen.order)):
         own: _Settings = construct("algorithm", _Settings, values)
         arguments = dict(own.regressor)
         cls = regressor_class(str(arguments.pop("name", None)))
