@@ -161,7 +161,8 @@ def completions(line: str) -> list[str]:
         return [f"{key}={o}" for o in options(key, folders) if o.startswith(value)]
     chosen = any(o.startswith(("env=", "experiment=")) for o in typed.overrides)
     # Without an env nothing composes; most keys are the same in all of them.
-    asked = (*["env=maze"] * (not chosen), *typed.overrides)
+    overrides = [o for o in typed.overrides if not o.startswith("hydra.")]
+    asked = (*["env=maze"] * (not chosen), *overrides)
     known = {
         group: None for group in group_names(folders) if not group.startswith("tuned")
     }

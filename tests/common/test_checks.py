@@ -41,7 +41,7 @@ GOOD = {
     "flag": [True],
 }
 BAD = {
-    "rate": ["fast", True, float("nan"), [1.0]],
+    "rate": ["fast", True, float("inf"), [1.0]],
     "old": [1.5, "4", True],
     "either": [None, 1.5],
     "kind": ["median", True, 2.0, None],
@@ -73,20 +73,20 @@ def test_another_value_is_refused_by_key_value_and_type(key):
     for value in BAD[key]:
         with pytest.raises(ConfigError) as told:
             construct("part", Part, {key: value})
-        assert f"part.{key}={value}: must be of type" in str(told.value)
+        assert (told.value.key, told.value.value) == (f"part.{key}", value)
     assert construct("part", Part, {}) == Part()
 
 
 def test_types_are_spelled_as_the_user_writes_them():
     for key, spelled in {
-        "rate": "float | None",
-        "kind": "Literal['mean', 'max', 2]",
-        "widths": "list[int]",
-        "flag": "bool",
+        "rate": "must be of type float | None",
+        "kind": "known: 2, max, mean",
+        "widths": "must be of type list[int]",
+        "flag": "must be true or false",
     }.items():
         with pytest.raises(ConfigError) as told:
             construct("part", Part, {key: object()})
-        assert str(told.value).endswith(f"must be of type {spelled}")
+        assert str(told.value).endswith(spelled)
 
 
 def test_types_that_only_a_type_checker_can_find_are_not_checked():
