@@ -76,12 +76,11 @@ def plans(arguments: Namespace) -> list[Plan]:
                 found.append(job)
     except Unknown as error:
         raise BcrlError(hints.explained(error)) from error
-    if _launched(found[0].hydra) and not (
-        multirun or found[0].hydra.mode == RunMode.MULTIRUN
-    ):
-        raise BcrlError("hydra/launcher: a sweep's jobs are launched; add -m")
-    if _launched(found[0].hydra) and any(map(over_experiments, parsed)):
-        raise BcrlError("experiment: with hydra/launcher, one at a time")
+    if any(_launched(job.hydra) for job in found):
+        if not multirun and found[0].hydra.mode != RunMode.MULTIRUN:
+            raise BcrlError("hydra/launcher: a sweep's jobs are launched; add -m")
+        if any(map(over_experiments, parsed)):
+            raise BcrlError("experiment: with hydra/launcher, one at a time")
     # What a folder says is the user's own, unless nobody named the folder.
     own = not getattr(arguments, "unnamed", False) and bool(folders)
     made = [_plan(job, job.hydra, folders, None if own else overrides) for job in found]
@@ -160,7 +159,12 @@ def _jobs(
         if any(o.is_sweep_override() for o in overrides):
             raise BcrlError(hints.swept())
         return jobs
-    params = [f"{k}={v}" for k, v in (first.sweeper.get("params") or {}).items()]
+    swept = first.sweeper.get("params") or {}
+    for key in map(str, swept):
+        if key.lstrip("+~").startswith("hydra"):
+            why = "a config can't sweep over Hydra's own keys"
+            raise ConfigError(f"hydra.sweeper.params.{key}", swept[key], why)
+    params = [f"{key}={value}" for key, value in swept.items()]
     meant = canonical(params, hints.folders)
     if meant != params:  # Hydra takes them as they are written
         parts = (each.partition("=") for each in meant)
