@@ -250,9 +250,7 @@ def _check_variant(choices: Mapping[str, str], folders: Paths) -> None:
     }
     for group, option in means.items():
         if choices.get(group, option) != option:
-            why = (
-                f"means {group}={option}, but {group}={choices[group]} is chosen; did "
-            )
+            why = f"means {group}={option}, but {group}={choices[group]} is chosen; "
             without = " without the experiment" if choices.get("experiment") else ""
             one = f"env={choices['env']} variant={name}{without}"
             line = " ".join(f"{each}={choices[each]}" for each in means)
