@@ -160,23 +160,26 @@ def answer(line: str, monkeypatch) -> str:
     return str(error.value)
 
 
-def test_the_answer_names_what_to_type(monkeypatch, tmp_path):
+def test_some_answers_name_what_to_type(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    assert len(WRONG) + len(SHOWN) >= 100
-    for base, wrong, right in WRONG:
-        assert right in answer(f"{base} {wrong}", monkeypatch), (base, wrong)
     for line, right in SHOWN:
         assert right in answer(line, monkeypatch), line
+    for base, wrong, right in WRONG[::4]:
+        assert right in answer(f"{base} {wrong}", monkeypatch), (base, wrong)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
-def test_the_answer_is_a_line_that_works(monkeypatch, tmp_path):
+def test_every_answer_is_a_line_that_works(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    for base, _, right in WRONG:
+    assert len(WRONG) + len(SHOWN) >= 100
+    for base, wrong, right in WRONG:
+        assert right in answer(f"{base} {wrong}", monkeypatch), (base, wrong)
         kept = "env=gymnasium" if right == "env.id=CartPole-v1" else base
         if "policy_reuse" in right:
             kept = f"{DQN} curriculum=on"
+        if right in ("transfer=none", "hydra/sweeper=basic") or "/launcher" in right:
+            kept += " curriculum=on,off" if "-m" in kept else ""
         assert "nothing was run" in asked(f"{kept} {right}", monkeypatch), right
 
 
