@@ -10,12 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from bcrl.config import jobs
 from bcrl.config import plan as compose
 from bcrl.errors import BcrlError
 from bcrl.run import runner
 from bcrl.run.workers import cores
-from tests.conftest import arguments, plan, plans
+from tests.conftest import plan, plans
 
 LOCAL = ("hydra/launcher=local", "hydra.launcher.seeds_per_job=1")
 SMALL = ("env=maze", "variant=plain,BC", "scale=smoke", "tag=t", "progress=none")
@@ -114,24 +113,6 @@ def test_the_parts_of_seeds_are_all_of_them_once():
 def test_a_part_that_is_none_is_refused(part):
     with pytest.raises(BcrlError, match=r"seeds\.part"):
         plan(MAZE, "seeds.count=3", f"seeds.part={part}")
-
-
-@pytest.mark.parametrize("name", ["local", "slurm"])
-def test_launchers_take_a_sweeps_jobs_and_no_commands(name):
-    launcher = f"hydra/launcher={name}"
-    assert jobs.left_to_hydra(arguments(MAZE, launcher, multirun=True))
-    with pytest.raises(BcrlError, match="add -m"):
-        jobs.left_to_hydra(arguments(MAZE, launcher))
-    for harm in (
-        "+hydra.launcher.setup=[x]",
-        "+hydra.launcher.srun_args=[x]",
-        "+hydra.launcher.additional_parameters={x: y}",
-        "+hydra.launcher.python=x",
-        "+hydra.launcher.name2='x;y'",
-        "+hydra.launcher.x='${device}'",
-    ):
-        with pytest.raises(BcrlError, match=r"hydra\.launcher"):
-            plans(MAZE, launcher, harm, multirun=True)
 
 
 def test_cores_are_those_that_slurm_has_given(monkeypatch):
