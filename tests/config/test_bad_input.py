@@ -163,7 +163,7 @@ def test_a_users_yaml_is_checked_too(tmp_path):
             assert words in str(error.value), case
 
 
-def test_a_sweep_whose_jobs_would_share_a_directory_is_refused():
+def test_a_sweep_whose_jobs_would_share_a_directory_is_rejected():
     with pytest.raises(
         BcrlError, match=r"algorithm.episodes=5 and algorithm.episodes=6"
     ):

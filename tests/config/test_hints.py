@@ -278,13 +278,13 @@ def test_seeds_that_are_none_are_rejected():
         ("boosting: glob(o*)", "boosting: 'off,on'"),
     ],
 )
-def test_a_sweep_in_a_file_that_hydra_reads_otherwise_is_refused(text, said, tmp_path):
+def test_a_sweep_in_a_file_that_hydra_reads_otherwise_is_rejected(text, said, tmp_path):
     (tmp_path / "experiment").mkdir()
     whole = "# @package _global_\nhydra: {mode: MULTIRUN, sweeper: {params: {%s}}}\n"
     (tmp_path / "experiment" / "mine.yaml").write_text(whole % text)
-    with pytest.raises(BcrlError) as refusal:
+    with pytest.raises(BcrlError) as error:
         plans(MAZE, "experiment=mine", config_dir=str(tmp_path))
-    assert said in str(refusal.value)
+    assert said in str(error.value)
 
 
 # --- one time, one folder ---
@@ -345,13 +345,13 @@ def test_a_variant_and_a_group_that_contradict_it_are_rejected(typed):
         ("scale: {name: 7}", ["scale.name=7"]),
     ],
 )
-def test_a_number_that_yaml_reads_otherwise_is_refused(text, said, tmp_path):
+def test_a_number_that_yaml_reads_otherwise_is_rejected(text, said, tmp_path):
     (tmp_path / "experiment").mkdir()
     (tmp_path / "experiment" / "mine.yaml").write_text(f"# @package _global_\n{text}\n")
-    with pytest.raises(BcrlError) as refusal:
+    with pytest.raises(BcrlError) as error:
         plans(MAZE, "experiment=mine", config_dir=str(tmp_path))
     for words in said:
-        assert words in str(refusal.value)
+        assert words in str(error.value)
 
 
 # --- the other commands ---
