@@ -13,6 +13,7 @@ from pathlib import PurePath
 
 from hydra.core.override_parser.types import ChoiceSweep, Glob
 
+from bcrl.common.terminal import say
 from bcrl.config.hydra_compose import Paths, group_names, now, options
 from bcrl.config.overrides import parse
 from bcrl.config.schema import NAME, section_of_seeds, texts
@@ -36,12 +37,25 @@ def canonical(overrides: Sequence[str], folders: Paths) -> list[str]:
     What is canonical stays as it is.
     """
     found: dict[str, None] = {}
-    for text in (text for each in overrides for text in _canonical(each, folders)):
+    given = _without_local(overrides)
+    for text in (text for each in given for text in _canonical(each, folders)):
         head = text.partition("=")[0]
         if head.startswith("seeds."):  # the last one holds
             found = {old: None for old in found if old.partition("=")[0] != head}
         found[text] = None
     return list(found)
+
+
+def _without_local(overrides: Sequence[str]) -> list[str]:
+    """The overrides without the former launcher `local`, whose processes are workers."""
+    if "hydra/launcher=local" not in overrides:
+        return list(overrides)
+    typed = [o.partition("n_jobs=")[2] for o in overrides if "launcher.n_jobs=" in o]
+    line = f"workers={next(filter(str.isdecimal, typed), os.cpu_count())}"
+    say(f"hydra/launcher=local: this launcher is gone; the command runs with {line}")
+    launcher = ("hydra/launcher=", "hydra.launcher.")
+    chosen = [o for o in overrides if not o.startswith(launcher)]
+    return chosen if any(o.startswith("workers=") for o in chosen) else [*chosen, line]
 
 
 def _canonical(text: str, folders: Paths) -> Iterator[str]:

@@ -158,8 +158,14 @@ def test_the_launchers_section_of_a_command_line_is_checked():
     error = rejected(MAZE, SLURM, "hydra.launcher.timeout_min=0", multirun=True)
     assert "hydra.launcher.timeout_min=0" in error
     assert "add -m" in rejected(MAZE, SLURM)
-    for other in ("local", "joblib"):
-        assert "workers=2" in rejected(MAZE, f"hydra/launcher={other}", multirun=True)
+    assert "workers=2" in rejected(MAZE, "hydra/launcher=joblib", multirun=True)
+
+
+@pytest.mark.parametrize("more", [["hydra.launcher.n_jobs=3"], ["workers=3"]])
+def test_the_former_local_launcher_is_a_number_of_workers(more, capsys):
+    (made,) = plans(MAZE, "hydra/launcher=local", *more, multirun=True)
+    assert made.config["workers"] == 3 and not made.launched
+    assert "hydra/launcher=local" in capsys.readouterr().err
 
 
 def bomb(levels: int = 30) -> str:
