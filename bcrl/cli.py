@@ -59,7 +59,7 @@ def _planned(asked: Namespace) -> list[Plan]:
     if asked.experimental_rerun:
         raise BcrlError("--experimental-rerun: unpickles a file, which isn't supported")
     if asked.config_path:
-        raise BcrlError("--config-path: add a folder of your own with --config-dir")
+        raise BcrlError("--config-path: add your folder with --config-dir")
     if asked.help:
         show(flags.manual(asked.config_dir))
         return []

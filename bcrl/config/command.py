@@ -47,7 +47,7 @@ def canonical(overrides: Sequence[str], folders: Paths) -> list[str]:
 
 
 def _without_local(overrides: Sequence[str]) -> list[str]:
-    """The overrides without the former launcher `local`, whose processes are workers."""
+    """The overrides, with workers in place of the former launcher `local`."""
     if "hydra/launcher=local" not in overrides:
         return list(overrides)
     typed = [o.partition("n_jobs=")[2] for o in overrides if "launcher.n_jobs=" in o]

@@ -82,7 +82,7 @@ _VALUES = {
     "progress": {"false": "none", "off": "none", "true": "bar", "on": "bar"},
     "variant": {"fqi": "plain", "dqn": "plain", "none": "plain", "off": "plain"},
 }
-#: The groups whose options have keys of their own.
+#: The groups whose options have keys.
 _SECTIONS = (
     "env",
     "algorithm",

@@ -75,7 +75,7 @@ def composed(name: str, overrides: tuple[str, ...], folders: Paths) -> DictConfi
     register_plugins()
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
-            register_plugins()  # once more: Hydra has a `now` of its own
+            register_plugins()  # once more: Hydra has its own `now`
             asked = [*overrides, *searchpath(folders)]
             return compose(name, asked, return_hydra_config=True)
     except BcrlError:

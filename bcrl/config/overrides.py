@@ -38,7 +38,7 @@ def parse(overrides: Sequence[str]) -> list[Override]:
 
 
 def over_experiments(override: Override) -> bool:
-    """Whether it is a sweep over experiments, each a sweep of its own."""
+    """Whether it is a sweep over experiments, each of which is a sweep."""
     return override.key_or_group == "experiment" and override.is_sweep_override()
 
 

@@ -78,7 +78,7 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
 
     `known` maps a tag to the config of the same choice of groups without any value
     overridden: None to the paper's reading, "released" to the authors' code's. Where
-    the config departs from all of them, its results get a directory of their own, below
+    the config departs from all of them, its results get a separate directory, below
     the name of the `env` choice.
     """
     compiling.check()

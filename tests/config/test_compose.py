@@ -169,7 +169,7 @@ def test_every_combination_composes_or_is_rejected_with_a_reason(env, algorithm)
         assert (ended != "rejected") == sensible(algorithm, *options), options
         names.setdefault(ended, []).append(options)
     del names["rejected"]
-    # A name means one thing, and a mixture of readings has a directory of its own.
+    # A name means one thing, and a mixture of readings has a separate directory.
     assert all(len(options) == 1 for options in names.values()), names
 
 

@@ -113,7 +113,7 @@ TAB = {
 
 @pytest.fixture
 def own(tmp_path, monkeypatch):
-    """A folder of configs of one's own."""
+    """A user's folder of configs."""
     (tmp_path / "mine" / "env").mkdir(parents=True)
     (tmp_path / "mine" / "env" / "my_maze.yaml").write_text("name: maze\n")
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))

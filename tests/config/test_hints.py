@@ -18,7 +18,7 @@ from tests.conftest import plan, plans
 
 MAZE, DQN = "env=maze", "env=linear_system algorithm=dqn"
 CART = "env=gymnasium env.id=CartPole-v1"
-#: What else is typed, what is wrong, and what has to be in the answer instead of it.
+#: The other words, the wrong word, and the words that the answer must contain.
 WRONG = [
     # flags of other tools
     ("", "--env maze", "env=maze"),

@@ -38,7 +38,7 @@ def options(group: str) -> dict[str, dict]:
     return {path.stem: yaml.safe_load(path.read_text()) for path in paths}
 
 
-#: What is chosen besides env and algorithm; an option added to conf/ is covered, too.
+#: The choices besides env and algorithm; an option added to conf/ is covered, too.
 CHOICES = [options(group) for group in ("curriculum", "boosting", "transfer")]
 #: What an algorithm's own section may say of learners and regressors.
 OWN = {
@@ -302,7 +302,7 @@ def test_one_of_several_lspi_stages_would_forget_the_others():
     assert [stage.learner.name for stage in made.stages] == ["lspi", "dqn"]
 
 
-# --- transfers of one's own ---
+# --- a user's transfers ---
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ def rejected(*overrides: str, **options) -> str:
 
 
 def own(folder: Path, text: str, place: str = "experiment/mine") -> str:
-    """Writes a config of one's own, and gives its folder."""
+    """Writes a user's config and returns its folder."""
     path = folder / "own" / f"{place}.yaml"
     path.parent.mkdir(parents=True, exist_ok=True)
     head = "# @package _global_\n" if place.startswith("experiment") else ""
