@@ -150,10 +150,8 @@ def sweep_table(found: list[Group]) -> pd.DataFrame:
             }
             for label, values in measured(variant).items():
                 name = label.replace(" ", "_")
-                known = (
-                    np.full(len(variant.seeds), np.nan) if values is None else values
-                )
-                low, high = bootstrap(known)
-                row |= {name: known.mean(), f"{name}_low": low, f"{name}_high": high}
+                given = np.array([np.nan]) if values is None else values
+                low, high = bootstrap(given)
+                row |= {name: given.mean(), f"{name}_low": low, f"{name}_high": high}
             rows.append(row | {"best": variant is group.best})
     return pd.DataFrame(rows)
