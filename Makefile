@@ -7,7 +7,8 @@ SCALE ?= quick
 WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup figures paper searches smoke report verify test lint bench bench-peer clean
+.PHONY: help setup figures paper searches smoke report verify test test-all lint docs bench \
+	bench-peer clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -21,15 +22,15 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[dev]'
 	@touch $@
 
-figures: $(READY) ## the paper's figures from runs of your own: 3 seeds a variant, minutes
+figures: $(READY) ## run the paper's experiments with 3 seeds per method and draw the figures
 	$(BIN)/bcrl -m experiment=fig1,fig2,fig4 scale=quick workers=$(WORKERS)
 	$(BIN)/bcrl-report --scale quick
 
-paper: $(READY) ## the same at the paper's number of seeds
+paper: $(READY) ## the same with the paper's number of seeds (one hour on two cores)
 	$(BIN)/bcrl -m experiment=fig1,fig2,fig4 scale=paper workers=$(WORKERS)
 	$(BIN)/bcrl-report --scale paper
 
-searches: $(READY) ## the searches of appendix C.3 on seeds of their own, with summary tables
+searches: $(READY) ## the searches of appendix C.3 on separate seeds, with summary tables
 	$(BIN)/bcrl -m experiment=search_target_update,search_offset,search_nu workers=$(WORKERS)
 	$(BIN)/bcrl-report --scale search
 
@@ -37,20 +38,29 @@ smoke: $(READY) ## every variant in seconds, then the report
 	$(BIN)/bcrl -m experiment=fig1,fig2,fig4 scale=smoke workers=$(WORKERS)
 	$(BIN)/bcrl-report --scale smoke
 
-report: $(READY) ## figures, claims and one HTML page of what is in runs/; SCALE=paper
+report: $(READY) ## draw figures, claims and one HTML page from runs/; SCALE=paper
 	$(BIN)/bcrl-report --scale $(SCALE)
 
-verify: $(READY) ## whether every result in runs/ is whole, unchanged and in its place
+verify: $(READY) ## check that every result in runs/ is complete, unchanged and in its place
 	$(BIN)/bcrl-verify
 
-test: $(READY) ## the tests
-	$(BIN)/python -m pytest --numprocesses 2
+test: $(READY) ## the fast tests (about 4 minutes on two cores)
+	$(BIN)/python -m pytest --numprocesses 2 -m "not slow and not slurm and not browser"
 
-lint: $(READY) ## style and unused code
+test-all: $(READY) ## all tests, with the coverage of the package
+	$(BIN)/python -m pytest --numprocesses 2 --cov=bcrl --cov-report=term
+
+lint: $(READY) ## style, spelling, layers of imports, types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell bcrl bench conf docs examples *.md
+	$(BIN)/lint-imports
+	$(BIN)/mypy
 
-bench: $(READY) ## speed, as ratios against the plain way in one run
+docs: $(READY) ## build the documentation site into site/, without network; links are checked
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+bench: $(READY) ## measure speed, as ratios against a plain implementation in one run
 	$(BIN)/python bench/forest.py
 	$(BIN)/python bench/iteration.py
 	$(BIN)/python bench/growth.py
@@ -59,7 +69,7 @@ bench: $(READY) ## speed, as ratios against the plain way in one run
 	$(BIN)/python bench/checkpoints.py
 	test ! -d runs/paper || $(BIN)/python bench/paper.py
 
-bench-peer: $(READY) ## the same against MushroomRL 1.10.2, in an environment of its own
+bench-peer: $(READY) ## the same against MushroomRL 1.10.2, in a separate environment
 	test -x .venv-peer/bin/python || $(PYTHON) -m venv .venv-peer
 	.venv-peer/bin/python -m pip install --quiet --constraint constraints.txt --editable .
 	.venv-peer/bin/python -m pip install --quiet pygame==2.6.1 opencv-python-headless==5.0.0.93
@@ -67,5 +77,5 @@ bench-peer: $(READY) ## the same against MushroomRL 1.10.2, in an environment of
 	.venv-peer/bin/python bench/peer.py
 
 clean: ## remove .venv and caches; results in runs/ stay
-	rm -rf $(VENV) .venv-peer .pytest_cache .ruff_cache
+	rm -rf $(VENV) .venv-peer .pytest_cache .ruff_cache .mypy_cache .import_linter_cache site
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

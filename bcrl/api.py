@@ -1,6 +1,6 @@
-"""For scripts and notebooks: tasks become stages, stages are run, results are a frame.
+"""For scripts and notebooks: tasks become stages, and `run` gives a data frame.
 
-The same objects as behind the `bcrl` command, without configs and files:
+The objects are those of the `bcrl` command, without configs and files:
 
     tasks = [CarOnHill(mass=m) for m in (0.8, 1.0, 1.2)]
     learner = FQI(iterations=20, episodes=200, regressor=Forest())
@@ -17,7 +17,6 @@ import pandas as pd
 from tqdm import tqdm
 
 from bcrl.common import compiling
-from bcrl.common.files import seed_path, seeds_of
 from bcrl.config.rules import course
 from bcrl.config.variant import Composition, order_of
 from bcrl.envs import Env, check_tasks, is_simulated
@@ -26,19 +25,12 @@ from bcrl.envs.gymnasium import Gymnasium
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.envs.maze import Maze
 from bcrl.errors import BcrlError, ConfigError
-from bcrl.evaluation import metrics as probes
+from bcrl.evaluation import metrics as fqi_metrics
 from bcrl.evaluation.step_metrics import StepProbe
 from bcrl.learning.dqn import DQN
 from bcrl.learning.fqi import FQI
 from bcrl.learning.lspi import LSPI
-from bcrl.learning.stage import (
-    CurriculumRun,
-    Learner,
-    SeedBatch,
-    Snapshot,
-    Stage,
-    snapshots,
-)
+from bcrl.learning.stage import Learner, SeedBatch, Snapshot, Stage, learn
 from bcrl.learning.transfer import (
     Boost,
     PolicyReuse,
@@ -50,28 +42,12 @@ from bcrl.learning.transfer import (
 from bcrl.q.regressors.ours import ForestRegressor as Forest
 from bcrl.q.regressors.ours import Tabular
 from bcrl.q.regressors.scikit import Sklearn
+from bcrl.results.read import read_folder
 from bcrl.run.workers import cores
 
-__all__ = [
-    "DQN",
-    "FQI",
-    "LSPI",
-    "Boost",
-    "CarOnHill",
-    "Forest",
-    "Gymnasium",
-    "LinearSystem",
-    "Maze",
-    "PolicyReuse",
-    "ResidualPolicy",
-    "Shape",
-    "Sklearn",
-    "Tabular",
-    "read",
-    "run",
-    "stages",
-    "warm_start",
-]
+__all__ = ["CarOnHill", "Gymnasium", "LinearSystem", "Maze", "read", "run", "stages"]
+__all__ += ["DQN", "FQI", "LSPI", "Forest", "Sklearn", "Tabular"]
+__all__ += ["Boost", "PolicyReuse", "ResidualPolicy", "Shape", "warm_start"]
 
 
 def stages(
@@ -80,15 +56,14 @@ def stages(
     *transfers: Transfer,
     curriculum: str | Callable[[int], Sequence[int]] | None = None,
 ) -> tuple[Stage, ...]:
-    """The stages of a course, the same as the command line's; a learner for all slots,
-    or one per slot.
+    """The stages of a curriculum, as the command makes them from a config.
 
-    The slots are the `tasks` as listed, the target last. With `curriculum` (as in the
-    group: "on", "off" or a function of the number of tasks) they are the tasks that it
-    visits, `tasks` then being listed once each. Without `transfers` the approximator
-    is passed on (`warm_start`): [target] · n is the plain algorithm, an easier task
-    first makes it C-. `Boost()` makes it B- or BC-, `Shape()` SC-, both SBC-. Raises
-    ConfigError for what makes no sense together.
+    The slots are the `tasks` as listed, the target last; `learner` is one for all slots
+    or a list with one per slot. With `curriculum` ("on", "off" or a function of the
+    number of tasks) each task is listed once, and the curriculum makes the slots.
+    Without `transfers` the approximator is passed on (`warm_start`): [target] · n is
+    the plain algorithm, and an easier task first makes it C-. `Boost()` makes it B- or
+    BC-, `Shape()` SC-, both SBC-. Raises ConfigError for invalid combinations.
     """
     tasks = list(tasks)
     if not tasks:
@@ -106,16 +81,16 @@ def stages(
     check_tasks(tasks[-1].name, different)
     chosen = Composition(tuple(different), order, *(boosts or [None]), *others)
     one = hasattr(learner, "learn") or not isinstance(learner, Iterable)
-    each = [learner] * len(order) if one else list(learner)
+    learners = [learner] * len(order) if one else list(learner)
     try:
-        return course(chosen, each)
-    except ConfigError as error:  # a config's keys, where there is no config
+        return course(chosen, learners)
+    except ConfigError as error:  # a config's key, where there is no config
         key = error.key.removeprefix("algorithm.")
         raise ConfigError(key, error.value, error.allowed) from error
 
 
 def _check(tasks: Sequence[Env], transfers: Sequence[Transfer], most: int) -> None:
-    """Raise ConfigError for arguments that no config could say."""
+    """Raise ConfigError for arguments that no config could have."""
     for task in tasks:
         if isinstance(task, type) or not hasattr(task, "n_actions"):
             raise ConfigError("tasks", task, "is no environment, such as Maze()")
@@ -129,43 +104,45 @@ def _check(tasks: Sequence[Env], transfers: Sequence[Transfer], most: int) -> No
         why = "must be one Boost() and one other at most, or warm_start alone"
         raise ConfigError("transfers", list(transfers), why)
     if len({is_simulated(task) for task in tasks}) > 1:
-        why = "simulators and pure environments don't mix"
+        why = "simulators and pure environments can't be combined"
         raise ConfigError("tasks", tasks[-1], why)
 
 
 def run(
-    course: Sequence[Stage],
+    stages: Sequence[Stage],
     seeds: Iterable[int] = range(3),
     metrics: Sequence[str] = ("return", "solved"),
     threads: int | None = None,
     progress: bool = True,
 ) -> pd.DataFrame:
-    """Train seeds through the stages, in lockstep; a row a seed and evaluation.
+    """Train seeds through the stages, in lockstep; one row per seed and evaluation.
 
-    Columns are seed, stage, task, then iteration and `metrics` (FQI) or step and those
-    of docs/metrics.md (DQN). Seeds have the same results in any company. Raises
-    BcrlError for seeds that diverge.
+    Columns are seed, stage, task, then iteration and `metrics` (FQI) or step and the
+    metrics of docs/reference/metrics.md (DQN). A seed's results do not depend on the
+    other seeds. Raises BcrlError for seeds that diverge.
     """
     compiling.check()
-    seeds, metrics, target = _seeds(seeds), tuple(metrics), course[-1].env
-    tasks = [*dict.fromkeys(s.env for s in course if s.env != target), target]
-    if isinstance(course[-1].learner, FQI):
-        probes.check(metrics, target)
-        probe = probes.Probe(seeds, tasks, metrics)
+    seeds, metrics, target = _checked(seeds), tuple(metrics), stages[-1].env
+    tasks = [*dict.fromkeys(s.env for s in stages if s.env != target), target]
+    probe: fqi_metrics.Probe | StepProbe
+    if isinstance(stages[-1].learner, FQI):
+        fqi_metrics.check_metrics(metrics, target)
+        probe = fqi_metrics.Probe(seeds, tasks, metrics)
     else:
         probe = StepProbe(seeds, tasks)
-    team = SeedBatch(seeds, probe.states, threads or cores())
+    batch = SeedBatch(seeds, probe.states, threads or cores())
     rows = []
-    length = sum(stage.learner.length for stage in course)
+    length = sum(stage.learner.length for stage in stages)
     with tqdm(total=length, unit=probe.index, disable=not progress) as bar:
-        for now in snapshots(CurriculumRun(course, team)):
-            rows += _rows(now, probe, seeds)
-            bar.set_description_str(f"task {now.stage.task}", refresh=False)
-            bar.update(now.count - bar.n)
+        for snapshot in learn(stages, batch):
+            rows += _rows(snapshot, probe, seeds)
+            bar.set_description_str(f"task {snapshot.stage.task}", refresh=False)
+            bar.update(snapshot.count - bar.n)
     return pd.DataFrame(rows)
 
 
-def _seeds(seeds: Iterable[int]) -> tuple[int, ...]:
+def _checked(seeds: Iterable[int]) -> tuple[int, ...]:
+    """The seeds; ConfigError unless they are different whole numbers."""
     if isinstance(seeds, Integral):
         raise ConfigError("seeds", seeds, f"name them: range({seeds}) or [{seeds}]")
     found = tuple(seeds)
@@ -175,26 +152,20 @@ def _seeds(seeds: Iterable[int]) -> tuple[int, ...]:
     return found
 
 
-def _rows(now: Snapshot, probe: probes.Probe | StepProbe, seeds: Sequence[int]) -> list:
-    rows = probe.measure(now)
+def _rows(
+    snapshot: Snapshot, probe: fqi_metrics.Probe | StepProbe, seeds: Sequence[int]
+) -> list[dict]:
+    """A snapshot's rows; BcrlError if a seed failed."""
+    measured, count = probe.measure(snapshot), snapshot.count
     if probe.failed:
         lost = ", ".join(f"seed {seeds[s]}: {why}" for s, why in probe.failed.items())
-        raise BcrlError(f"at {probe.index} {now.count}: {lost}")
-    where = {"stage": now.stage.number, "task": now.stage.task, probe.index: now.count}
-    return [
-        {"seed": seed} | where | measured
-        for seed, measured in zip(seeds, rows, strict=True)
-    ]
+        raise BcrlError(f"at {probe.index} {count}: {lost}")
+    where = {"stage": snapshot.stage.number, "task": snapshot.stage.task}
+    where[probe.index] = count
+    pairs = zip(seeds, measured, strict=True)
+    return [{"seed": seed} | where | metrics for seed, metrics in pairs]
 
 
 def read(folder: str | Path) -> pd.DataFrame:
     """The seeds that `bcrl` has recorded in a run's folder, as `run` gives them."""
-    numbers = seeds_of(Path(folder), "csv")
-    if not numbers:
-        raise BcrlError(f"{folder}: there is no seed_*.csv")
-    found = {n: pd.read_csv(seed_path(Path(folder), n, "csv")) for n in numbers}
-    return (
-        pd.concat(found, names=["seed", None])
-        .reset_index("seed")
-        .reset_index(drop=True)
-    )
+    return read_folder(folder)

@@ -12,8 +12,9 @@ import tempfile
 import time
 from argparse import Namespace
 
-from bcrl.config import schema, vetting
-from bcrl.run import checkpoints, records, runner
+from bcrl.config import jobs, schema
+from bcrl.results.layout import seed_path
+from bcrl.run import checkpoints, runner
 
 CHOICES = {
     "maze FQI": ["env=maze", "seeds.count=4"],
@@ -41,7 +42,7 @@ class Timed:
 
 
 def main(every: str = "60") -> None:
-    schema.register()
+    schema.register_schema()
     print(f"{'':14}{'run, s':>8}{'written':>9}{'MiB':>8}{'ms each':>9}{'share':>8}")
     for name, choice in CHOICES.items():
         with tempfile.TemporaryDirectory() as folder:
@@ -52,12 +53,12 @@ def main(every: str = "60") -> None:
                 config_dir=None,
                 config_name=None,
             )
-            (plan,) = vetting.plans(asked)
-            timed = Timed(checkpoints.save)
-            checkpoints.save = timed
+            (plan,) = jobs.plans(asked)
+            timed = Timed(checkpoints.save_checkpoint)
+            checkpoints.save_checkpoint = timed
             runner.run(plan)
-            checkpoints.save = timed.function
-            facts = records.seed_path(plan.directory, 0, "json").read_text()
+            checkpoints.save_checkpoint = timed.function
+            facts = seed_path(plan.directory, 0, "json").read_text()
             run = json.loads(facts)["wall_seconds"]
         each = 1e3 * timed.seconds / max(1, timed.calls)
         print(

@@ -1,10 +1,10 @@
 """DQN in seed-lockstep against one seed in plain torch: python bench/dqn.py
 
-Both learn the linear system's target task with the paper's settings, on one core, by
-turns: environment, exploration, replay, update; evaluation is timed apart. Plain is a
-`torch.nn` network with autograd, `torch.optim.Adam`, a NumPy replay and the same
-environment with one lane. Microseconds of CPU a seed and environment step, while both
-make an update a step.
+Both learn the linear system's target task with the paper's settings on one core, and
+take turns. A step is acting, replay and update; evaluation is timed separately. The
+plain version is a `torch.nn` network with autograd, `torch.optim.Adam`, a NumPy replay
+and the same environment with one lane. Times are microseconds of CPU per seed and
+environment step, with one update per step.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def main() -> None:
                 evaluate(now, range(n))
                 took = (time.process_time() - began) / STEPS / n
                 evaluation[n] = min(evaluation.get(n, took), took)
-    print(f"{'seeds':>8}{'us a seed and step':>20}{'ratio':>8}{'evaluation, us':>16}")
+    print(f"{'seeds':>8}{'us per seed and step':>20}{'ratio':>8}{'evaluation, us':>16}")
     print(f"{'1, plain':>8}{best['plain'] * 1e6:20.0f}{1.0:7.1f}x")
     for n in groups:
         ratio = best["plain"] / best[n]

@@ -58,7 +58,7 @@ class Stopwatch:
 
 
 def by_turns(runs: list[Iterator[Iteration]]) -> list[tuple[float, float]]:
-    """The least CPU milliseconds of an iteration of each, and its nodes a tree."""
+    """The least CPU milliseconds of an iteration of each, and its nodes per tree."""
     for run in runs:
         for _ in range(EARLY):
             next(run)
@@ -68,7 +68,7 @@ def by_turns(runs: list[Iterator[Iteration]]) -> list[tuple[float, float]]:
             began = time.process_time()
             now = next(run)
             took = (time.process_time() - began) * 1e3
-            forests = [f for models in now.learned.residual.models for f in models]
+            forests = [f for models in now.result.residual.models for f in models]
             best[i] = min(best[i], (took, np.mean([f.node_counts for f in forests])))
     return best
 
@@ -76,28 +76,28 @@ def by_turns(runs: list[Iterator[Iteration]]) -> list[tuple[float, float]]:
 def residuals() -> None:
     """An iteration at residual 1 and at residual 40, of the same dataset."""
     *_, first = itertools.islice(iterations(1000), EARLY)
-    on_one = replace(StageInit(first.learned), base=first.learned.q)
+    on_one = replace(StageInit(first.result), base=first.result.q)
     run = iterations(1000, 1, on_one)
-    frozen = [now.learned.residual for now in itertools.islice(run, 3)]
+    frozen = [now.result.residual for now in itertools.islice(run, 3)]
     # 39 different residuals would take minutes to learn: three serve in turn, each
     # looked through from the root every time.
-    terms = [first.learned.q, *(frozen[i % 3] for i in range(RESIDUAL - 2))]
+    terms = [first.result.q, *(frozen[i % 3] for i in range(RESIDUAL - 2))]
     base = Stopwatch(Sum(tuple(terms)))
-    nothing = StageInit(first.learned)
+    nothing = StageInit(first.result)
     starts = (nothing, replace(nothing, base=base))
     one, forty = by_turns([iterations(1000, 1, start) for start in starts])
-    points = len(first.learned.data[0].points)
+    points = len(first.result.data[0].points)
     for number, (took, nodes) in ((1, one), (RESIDUAL, forty)):
-        print(f"residual {number:2}: {took:7.1f} ms, {nodes:.0f} nodes a tree")
+        print(f"residual {number:2}: {took:7.1f} ms, {nodes:.0f} nodes per tree")
     print(f"ratio: {forty[0] / one[0]:.3f}")
-    print(f"once a stage: base at {points} points, {base.seconds * 1e3:.0f} ms")
+    print(f"once per stage: base at {points} points, {base.seconds * 1e3:.0f} ms")
 
 
 def main() -> None:
     residuals()
     sizes = [(250, 1), (500, 1), (1000, 1), (250, 2), (250, 4)]
     times = by_turns([iterations(*size) for size in sizes])
-    print(f"\n{'episodes':>9}{'seeds':>7}{'ms an iteration':>17}{'nodes a tree':>14}")
+    print(f"\n{'episodes':>9}{'seeds':>7}{'ms per iteration':>17}{'nodes/tree':>12}")
     for (episodes, seeds), (took, nodes) in zip(sizes, times, strict=True):
         print(f"{episodes:9}{seeds:7}{took:17.1f}{nodes:14.0f}")
 

@@ -29,7 +29,7 @@ class Plain:
     """The plain way: arrays of all transitions, one scikit-learn forest an action."""
 
     def __init__(self, env: Env, seen: Iteration) -> None:
-        (d,) = seen.learned.data
+        (d,) = seen.result.data
         again = np.repeat(np.arange(len(d.state)), d.multiplicity)
         self.env, self.action = env, d.action[again]
         self.reward, self.absorbing = d.reward[again], d.absorbing[again]

@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from bcrl.config import schema, vetting
+from bcrl.config import jobs, schema
 from bcrl.config.plan import Plan
 from bcrl.evaluation.step_metrics import evaluate
-from bcrl.learning.lockstep import DQNTrainer
+from bcrl.learning.dqn import DQNTrainer
 from bcrl.learning.stage import SeedBatch, learn
 from bcrl.learning.transfer import begin
 
@@ -31,7 +31,7 @@ def planned(variant: str) -> Plan:
     """The method's plan, its pretraining in LQ cut short."""
     choice = ["env=linear_system", "algorithm=dqn", f"variant={variant}"]
     choice += ["algorithm.steps=[600,30000]"] * (variant == "C")
-    (plan,) = vetting.plans(
+    (plan,) = jobs.plans(
         Namespace(overrides=choice, multirun=False, config_dir=None, config_name=None)
     )
     return plan
@@ -39,11 +39,11 @@ def planned(variant: str) -> Plan:
 
 def running(plan: Plan, seeds: tuple[int, ...]) -> DQNTrainer:
     """A team in its target task with a full replay."""
-    team, learned = SeedBatch(seeds, np.zeros((1, 4))), None
-    for now in learn(plan.stages[:-1], team):
-        learned = now.learned
+    batch, result = SeedBatch(seeds, np.zeros((1, 4))), None
+    for now in learn(plan.stages[:-1], batch):
+        result = now.result
     last = plan.stages[-1]
-    run = DQNTrainer(last.learner, last, begin(last.transfers, learned), team)
+    run = DQNTrainer(last.learner, last, begin(last.transfers, result), batch)
     for _ in range(last.learner.replay_size):
         run.act()
         run.end_step()
@@ -55,7 +55,7 @@ def running(plan: Plan, seeds: tuple[int, ...]) -> DQNTrainer:
 
 def cost(run: DQNTrainer) -> tuple[float, float]:
     """Seconds of CPU of a step with its update, and of an evaluation a step."""
-    n = len(run.team.seeds)
+    n = len(run.batch.seeds)
     began = time.process_time()
     for _ in range(STEPS):
         run.act()
@@ -63,7 +63,7 @@ def cost(run: DQNTrainer) -> tuple[float, float]:
         run.end_step()
     stepping = (time.process_time() - began) / STEPS / n
     began = time.process_time()
-    evaluate(run.moment(), run.team.seeds)
+    evaluate(run.snapshot(), run.batch.seeds)
     every = run.settings.evaluate_every
     return stepping, (time.process_time() - began) / every / n
 
@@ -81,7 +81,7 @@ def multiplying() -> float:
 
 
 def main() -> None:
-    schema.register()
+    schema.register_schema()
     torch.set_num_threads(1)
     print(
         f"this core multiplies (32, 128) by (128, 128) at {multiplying():.0f} GFLOP/s"

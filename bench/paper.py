@@ -30,8 +30,8 @@ def main(root: Path) -> None:
     folders = sorted({path.parent for path in root.glob("*/*/seed_*.json")})
     if not folders:
         sys.exit(f"no runs in {root}; make paper")
-    head = f"{'CPU seconds a run, one core':32}{'seeds':>6}{'ours':>9}{'theirs':>12}"
-    print(f"{head}{'ratio':>14}{'us a step':>11}")
+    head = f"{'CPU seconds per run, one core':32}{'seeds':>6}{'ours':>9}{'theirs':>12}"
+    print(f"{head}{'ratio':>14}{'us per step':>11}")
     per_step = []
     for folder in folders:
         facts = [json.loads(p.read_text()) for p in folder.glob("seed_*.json")]

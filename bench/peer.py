@@ -1,11 +1,11 @@
-"""A peer beside us, one core: MushroomRL's FQI and DQN, same sizes: make bench-peer
+"""MushroomRL's FQI and DQN against ours, same sizes, on one core: make bench-peer
 
-Wants MushroomRL 1.10.2 in the environment. FQI: 1000 random episodes of *its* car on
-the hill (1 kg), its agent with scikit-learn's extra-trees (50 trees, as in the paper),
-against our learner on our car with as many episodes of its own: an iteration, after a
-few. DQN: its agent with the paper's network, batch and replay, on *our* linear system
-wrapped in its environment class, against lockstep of 1 and of 20 seeds: a step with its
-update. By turns, CPU time, the least of several.
+Needs MushroomRL 1.10.2 in the environment. FQI: one iteration, after a few others, on
+1000 random episodes of *its* car on the hill (1 kg) by its agent with scikit-learn's
+extra-trees (50 trees, as in the paper), and of our car by our learner. DQN: one step
+with its update, of its agent with the paper's network, batch and replay on *our* linear
+system, and of 1 and 20 of our seeds in lockstep. Both take turns; the least CPU time of
+several counts.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def our_fqi() -> Callable[[], object]:
     env = CarOnHill(mass=1.0)
     stage = Stage(1, 1, env, FQI(10**9, EPISODES, ForestRegressor()), (), 0)
     run = learn([stage], SeedBatch((0,), probed_states(env)))
-    (data,) = next(run).learned.data
+    (data,) = next(run).result.data
     print(f"our dataset: {int(data.multiplicity.sum())} transitions")
     return lambda: next(run)
 

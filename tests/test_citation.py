@@ -13,7 +13,7 @@ ROOT = Path(__file__).parent.parent
 CFF = yaml.safe_load((ROOT / "CITATION.cff").read_text())
 #: Of the schema's keys those that are used.
 TOP = {
-    *("cff-version", "message", "type", "title", "version"),
+    *("cff-version", "message", "type", "title", "version", "license"),
     *("authors", "abstract", "keywords", "preferred-citation"),
 }
 

@@ -1,4 +1,4 @@
-"""The wheel works outside the repository: in an empty folder, from its own files."""
+"""The wheel works outside of the repository, in an empty folder."""
 
 import json
 import os
@@ -16,11 +16,12 @@ from bcrl.config.hydra_compose import CONF
 
 ROOT = Path(__file__).parent.parent
 FAST = ("scale=smoke", "algorithm/regressor=tabular", "progress=none")
+pytestmark = pytest.mark.slow
 pytest.importorskip("hatchling")  # of the extra `dev`
 
 
 def build(source: Path, folder: Path, *what: str) -> list[Path]:
-    """What `python -m build` makes, with the build backend that is installed here."""
+    """The files that `python -m build` makes, with the installed build backend."""
     command = [sys.executable, "-m", "build", "--no-isolation", *what]
     done = subprocess.run(
         [*command, "--outdir", str(folder), str(source)], capture_output=True, text=True
@@ -53,8 +54,7 @@ def installed(wheel, tmp_path_factory) -> Path:
     pip = [sys.executable, "-m", "pip", "--python", str(programs / "python")]
     install = ["install", "--quiet", "--no-deps", "--no-index", "--no-compile"]
     subprocess.run([*pip, *install, str(wheel)], check=True)
-    # Only now: pip must not take our own installation for the one that is wanted. What
-    # an editable one has put there is not followed.
+    # Only now: pip must not take our own installation for the wanted one.
     (place,) = folder.glob("lib/python*/site-packages")
     ours = [path for path in sys.path if Path(path).name.endswith("-packages")]
     (place / "dependencies.pth").write_text("\n".join(ours) + "\n")
@@ -89,10 +89,8 @@ def test_all_that_is_no_cache_is_in_the_wheel(wheel):
     }
     configs = {f"bcrl/conf/{p.relative_to(CONF)}" for p in CONF.rglob("*.yaml")}
     assert code | configs == {name for name in packed if name.startswith("bcrl/")}
-    assert {name.split("/")[0] for name in packed} == {
-        "bcrl",
-        "boosted_curriculum_rl-0.1.0.dist-info",
-    }
+    tops = {name.split("/")[0] for name in packed}
+    assert tops == {"bcrl", "boosted_curriculum_rl-0.1.0.dist-info"}
 
 
 def test_the_sources_archive_makes_the_same_wheel(wheel, tmp_path):
@@ -100,12 +98,7 @@ def test_the_sources_archive_makes_the_same_wheel(wheel, tmp_path):
     with tarfile.open(archive) as packed:
         packed.extractall(tmp_path / "unpacked", filter="data")
     (source,) = (tmp_path / "unpacked").iterdir()
-    for needed in (
-        "README.md",
-        "docs/architecture.md",
-        "tests/conftest.py",
-        "Makefile",
-    ):
+    for needed in ("README.md", "docs/architecture.md", "tests/conftest.py"):
         assert (source / needed).exists()
     (again,) = build(source, tmp_path / "wheel", "--wheel")
     assert contents(again) == contents(wheel)
@@ -131,10 +124,11 @@ def test_it_runs_reports_and_verifies_in_an_empty_folder(outside, tmp_path):
         assert done.returncode == 0 and "maze" in done.stdout, done.stderr
 
 
-def test_the_oracle_prints_its_table(outside):
-    done = outside("python", "-m", "bcrl.oracle", "maze", "--height", "0.95")
-    assert done.returncode == 0, done.stderr
-    assert done.stderr.startswith("V*(s0) = -47.5575")
+def test_the_oracle_prints_its_table_also_by_its_old_name(outside):
+    for name in ("bcrl.oracle", "bcrl.evaluation.oracle"):
+        done = outside("python", "-m", name, "maze", "--height", "0.95")
+        assert done.returncode == 0, done.stderr
+        assert done.stderr.startswith("V*(s0) = -47.5575")
 
 
 def test_a_users_own_env_comes_from_a_folder_and_a_module(outside, tmp_path):
@@ -167,6 +161,6 @@ def test_a_package_inside_another_projects_checkout_is_not_of_its_revision(
     who = ("-c", "user.name=x", "-c", "user.email=x@example.org")
     for command in (["init", "-q"], [*who, "commit", "-q", "--allow-empty", "-m", "x"]):
         subprocess.run([git, "-C", str(project), *command], check=True)
-    program = "from bcrl import records; print(records.provenance()['git'])"
+    program = "from bcrl.run.origin import run_origin; print(run_origin()['git'])"
     done = outside("python", "-c", program)
     assert done.stdout == "{'revision': None, 'dirty': False}\n", done.stderr

@@ -1,19 +1,20 @@
-"""numba's cache of compiled code on disk, made to survive whatever happens to it.
+"""numba's cache of compiled code on disk, made safe against damage and old code.
 
-numba keeps an index and numbered files and trusts both: half a file stops every run
-until somebody removes it, and a process killed between the two leaves an index that
-names older code. Here each file is sealed by a hash of it and of what it belongs to. A
-damaged one counts as absent; what can't be written, or has no folder, is compiled
-again.
+numba trusts its index and its numbered files: half a file stops every run until someone
+removes it, and a process killed between two writes leaves an index that names older
+code. Here a hash at the end of each file seals its content together with the source and
+the key it belongs to. A damaged file counts as absent. If the cache can't be written,
+the code is compiled again.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import os
 from collections.abc import Iterator
-from functools import partial
+from pathlib import Path
 from typing import IO, Any
 
 import numba
@@ -22,29 +23,29 @@ from numba.core import caching
 
 from bcrl.errors import BcrlError
 
-#: A decorator as numba.njit, whose compiled code is kept on disk.
-kept = partial(numba.njit, cache=True)
+#: A decorator like numba.njit whose compiled code is kept on disk.
+kept: Any = functools.partial(numba.njit, cache=True)
 
 __all__ = ["check", "guvectorize", "kept", "why_uncached"]
 
-SEAL = hashlib.sha256().digest_size  # bytes at a file's end
+_SEAL = hashlib.sha256().digest_size  # bytes at the end of a file
 
 
 class Files(caching.IndexDataCacheFile):
-    """numba's files of one function, each with a seal at its end, which numba skips."""
+    """numba's cache files of one function, each with a seal, which numba ignores."""
 
     def load(self, key: Any) -> Any:
-        """The compiled code that was kept under this key, or None."""
+        """The compiled code for this key, or None."""
         self._key = key
         try:
             return super().load(key)
-        except Exception:  # sealed by another version of numba, perhaps
+        except Exception:  # damaged, or written by another version of numba
             return None
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep code, in place of what is damaged or outdated."""
+        """Write code; replace a damaged or outdated file."""
         self._key = key
-        with contextlib.suppress(OSError):  # what can't be kept is compiled again
+        with contextlib.suppress(OSError):
             super().save(key, data)
 
     def _load_index(self) -> dict:
@@ -52,7 +53,7 @@ class Files(caching.IndexDataCacheFile):
 
     def _load_data(self, name: str) -> Any:
         if not self._is_whole(self._data_path(name)):
-            raise OSError(f"{name} is damaged, or holds other code")
+            raise OSError(f"{name} is damaged or holds other code")
         return super()._load_data(name)
 
     @contextlib.contextmanager
@@ -60,26 +61,23 @@ class Files(caching.IndexDataCacheFile):
         with super()._open_for_write(filepath) as file:
             yield file
             file.flush()
-            with open(file.name, "rb") as written:
-                file.write(self._seal(filepath, written.read()))
+            file.write(self._seal(filepath, Path(file.name).read_bytes()))
 
     def _is_whole(self, path: str) -> bool:
         try:
-            with open(path, "rb") as file:
-                stored = file.read()
+            stored = Path(path).read_bytes()
         except OSError:
             return False
-        return stored[-SEAL:] == self._seal(path, stored[:-SEAL])
+        return stored[-_SEAL:] == self._seal(path, stored[:-_SEAL])
 
     def _seal(self, path: str, content: bytes) -> bytes:
-        """A hash of a file, and of the source and the key that its code belongs to."""
         key = None if path == self._index_path else self._key
         about = repr((self._version, self._source_stamp, key)).encode()
         return hashlib.sha256(content + about).digest()
 
 
 class Nowhere(caching._CacheLocator):
-    """The last resort, of functions that no folder can keep."""
+    """numba's last resort: a function whose code no folder can keep."""
 
     tried: str | None = None  # the folder beside the last such function
 
@@ -93,28 +91,46 @@ class Nowhere(caching._CacheLocator):
     def ensure_cache_path(self) -> None: ...
 
     def get_cache_path(self) -> str:
-        return os.path.join(os.devnull, "numba")  # never there, nor can it be made
+        return os.path.join(os.devnull, "numba")  # can't exist
 
     def get_source_stamp(self) -> str:
         return ""
 
-    def get_disambiguator(self) -> str:
-        return ""
+    get_disambiguator = get_source_stamp
+
+
+@functools.cache
+def _sources(folder: str) -> str:
+    """A hash of all modules in a folder."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(folder).glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _source_stamp(locator: Any) -> str:
+    """What outdates a function's code: a change of any module beside the function.
+
+    numba compares only the function's own module, but compiled code contains the
+    functions of other modules that it calls. Ours stand in the same package.
+    """
+    return _sources(os.path.dirname(locator._py_file))
 
 
 def _register() -> None:
-    """Have numba keep compiled code in this way, from here on."""
+    """Make numba keep compiled code in this way from now on."""
     if caching.IndexDataCacheFile is Files:
         return
     caching.IndexDataCacheFile = Files
+    caching._SourceFileBackedLocatorMixin.get_source_stamp = _source_stamp
     usual = caching.Cache.save_overload
 
     def save_overload(cache: caching.Cache, sig: Any, data: Any) -> None:
-        with contextlib.suppress(OSError):  # the folder has vanished, say
+        with contextlib.suppress(OSError):  # for example, the folder has vanished
             usual(cache, sig, data)
 
     caching.Cache.save_overload = save_overload
-    # Without a home numba would make a folder called ~ in the current one.
+    # Without a home, numba would make a folder called ~ in the current one.
     user = os.environ.get("XDG_CACHE_HOME", os.path.expanduser("~/.cache"))
     locators = caching.CompileResultCacheImpl._locator_classes
     known = os.path.isabs(user)
@@ -125,20 +141,20 @@ def _register() -> None:
 
 
 def check() -> None:
-    """BcrlError if numba was told not to compile; parts of ours can't do without."""
+    """Raise BcrlError if numba may not compile: some loops need it."""
     if numba.config.DISABLE_JIT:
-        text = "bcrl's loops have to be compiled; unset it (env -u NUMBA_DISABLE_JIT)"
-        raise BcrlError(f"NUMBA_DISABLE_JIT={numba.config.DISABLE_JIT}: {text}")
+        why = "bcrl's loops have to be compiled; unset it (env -u NUMBA_DISABLE_JIT)"
+        raise BcrlError(f"NUMBA_DISABLE_JIT={numba.config.DISABLE_JIT}: {why}")
 
 
 def why_uncached() -> str | None:
-    """A sentence for those whose compiled code is lost with the process."""
+    """Why compiled code is lost with the process and what to do; None if it is kept."""
     if Nowhere.tried is None:
         return None
     return (
         f"compiled code isn't kept, so each start takes a minute longer: neither "
-        f"{Nowhere.tried} nor a cache folder of yours can be written; set "
-        "NUMBA_CACHE_DIR to one that can"
+        f"{Nowhere.tried} nor your cache folder can be written; set NUMBA_CACHE_DIR "
+        "to a folder that can"
     )
 
 

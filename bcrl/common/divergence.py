@@ -1,4 +1,4 @@
-"""Whether learned values run away, which runs and their report both want to know."""
+"""Whether learned values diverge, for a run's closing lines and for its report."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-FAR = 10.0  # times its yardstick: above this a value counts as diverging
+_LIMIT = 10.0  # times the reference: a larger value counts as diverging
 
 
 def diverging(metrics: Mapping[str, NDArray[np.float64]]) -> dict[str, float]:
-    """The metrics of values that diverge, and how large the largest is.
+    """The metrics (arrays (…, rows)) that diverge, and their largest magnitudes.
 
-    Of arrays (…, rows). An error's yardstick is the error that the run begins with,
-    `q_mean`'s the largest discounted return that was measured.
+    The reference of an error is the error at the run's beginning, that of `q_mean` the
+    largest measured discounted return.
     """
     found = {}
     for name, values in metrics.items():
         if name.startswith("q_error"):
-            yardstick = _largest(values[..., :1])
+            reference = _largest(values[..., :1])
         elif name == "q_mean" and "discounted_return" in metrics:
-            yardstick = 1.0 + _largest(metrics["discounted_return"])
+            reference = 1.0 + _largest(metrics["discounted_return"])
         else:
             continue
-        if (most := _largest(values)) > FAR * yardstick > 0.0:
+        if (most := _largest(values)) > _LIMIT * reference > 0.0:
             found[name] = most
     return found
 

@@ -1,4 +1,4 @@
-"""Files that are whole or absent, and documents that know if they were changed."""
+"""Atomic files, and documents with a digest that shows changes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DIGEST = "digest"  # a sealed document's key for the hash of all its others
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> Path:
-    """Let `write` fill a hidden neighbour of `path`, then rename it to `path`.
+    """Let `write` fill a hidden file beside `path`, then rename it to `path`.
 
     A reader sees the old file or the new one, never half of one, and once this returns
     the new one survives a power cut. Raises BcrlError if the folder is gone or cannot
@@ -29,7 +29,12 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> Path:
             handle.flush()
             os.fsync(handle.fileno())
         os.replace(hidden, path)
-        _sync_folder(path.parent)
+        with contextlib.suppress(OSError):  # not every file system can sync a folder
+            folder = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
     except OSError as error:
         gone = "" if path.parent.is_dir() else f"; the folder {path.parent} is gone"
         why = error.strerror or error
@@ -40,31 +45,9 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> Path:
     return path
 
 
-def _sync_folder(folder: Path) -> None:
-    """Make a rename in `folder` durable, where the file system knows how."""
-    with contextlib.suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
-
-
 def write_text(path: Path, text: str) -> Path:
     """Write UTF-8 text with Unix line ends, atomically."""
     return write_atomically(path, lambda handle: handle.write(text.encode()))
-
-
-def seed_path(directory: Path, seed: int, suffix: str) -> Path:
-    """`seed_0007.csv` and its companions."""
-    return directory / f"seed_{seed:04d}.{suffix}"
-
-
-def seeds_of(directory: Path, suffix: str) -> list[int]:
-    """The seeds, by number, that a folder has files of; other files are passed over."""
-    stems = (path.stem.removeprefix("seed_") for path in directory.glob("seed_*"))
-    seeds = sorted({int(stem) for stem in stems if stem.isdecimal()})
-    return [seed for seed in seeds if seed_path(directory, seed, suffix).exists()]
 
 
 def user_folder(variable: str, usual: str) -> Path | None:
@@ -81,20 +64,11 @@ def user_folder(variable: str, usual: str) -> Path | None:
 
 
 def make_directory(directory: Path, key: str) -> None:
-    """Make a folder and those above it; BcrlError names `key` if that can't be done."""
+    """Make a folder and those above it; BcrlError names `key` if that fails."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BcrlError(f"{key}: can't make {directory}: {error.strerror}") from error
-
-
-def remove_half_written(folder: Path, start: str) -> None:
-    """Remove what processes killed while writing files `start`… have left.
-
-    For those only who hold the lock under which such files are written.
-    """
-    for left in folder.glob(f".{start}*.tmp"):
-        left.unlink(missing_ok=True)
 
 
 def sha256(data: bytes) -> str:
@@ -109,7 +83,7 @@ def sealed(document: dict[str, Any]) -> str:
 
 
 def is_intact(document: dict[str, Any]) -> bool:
-    """Whether a document that `sealed` wrote still has the values that it had."""
+    """Whether the values of a document that `sealed` wrote are unchanged."""
     rest = {key: value for key, value in document.items() if key != DIGEST}
     return document.get(DIGEST) == _digest(rest)
 

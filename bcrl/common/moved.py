@@ -1,4 +1,4 @@
-"""Modules' old names, which scripts and configs may still use: old name → new name."""
+"""Old names of modules, which scripts and configs may still use."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
-MOVED = {
+_LEARNING = ("bellman", "curriculum", "policies", "replay", "rollout", "stage")
+#: Old name → new name; modules below a package move with it.
+MOVED = {f"bcrl.{name}": f"bcrl.learning.{name}" for name in (*_LEARNING, "transfer")}
+MOVED |= {
     "bcrl.algorithms": "bcrl.config.algorithms",
-    "bcrl.bellman": "bcrl.learning.bellman",
-    "bcrl.curriculum": "bcrl.learning.curriculum",
     "bcrl.data": "bcrl.learning.dataset",
     "bcrl.drawing": "bcrl.envs.rendering",
     "bcrl.gym": "bcrl.envs.gym_api",
@@ -21,31 +22,26 @@ MOVED = {
     "bcrl.loggers": "bcrl.results.loggers",
     "bcrl.oracle": "bcrl.evaluation.oracle",
     "bcrl.pack": "bcrl.common.serialization",
-    "bcrl.policies": "bcrl.learning.policies",
     "bcrl.probes": "bcrl.evaluation.metrics",
     "bcrl.q.estimator": "bcrl.q.forest.estimator",
     "bcrl.q.mlp": "bcrl.q.networks.mlp",
     "bcrl.q.regression": "bcrl.q.regressors.base",
     "bcrl.q.scikit": "bcrl.q.regressors.scikit",
-    "bcrl.replay": "bcrl.learning.replay",
-    "bcrl.rollout": "bcrl.learning.rollout",
-    "bcrl.stage": "bcrl.learning.stage",
     "bcrl.streams": "bcrl.common.seeding",
-    "bcrl.transfer": "bcrl.learning.transfer",
 }
 
 
 class _Moved(Loader):
-    """Loads a module under its old name, as the same object that has the new one."""
+    """Imports a module by its old name, as the same object as by its new one."""
 
     def __init__(self, new: str) -> None:
         self.new = new
 
     @classmethod
     def find_spec(cls, name: str, path: Any = None, target: Any = None) -> Any:
-        """The spec of a module below one that has moved; None for all others."""
+        """The spec of a module that has moved; None for all others."""
         for old, new in MOVED.items() if name.startswith("bcrl.") else ():
-            if name == old or name.startswith(f"{old}."):
+            if f"{name}.".startswith(f"{old}."):
                 loader = cls(new + name.removeprefix(old))
                 found = importlib.util.find_spec(loader.new)
                 package = found is not None and found.submodule_search_locations
@@ -53,13 +49,13 @@ class _Moved(Loader):
         return None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        """The module that has moved."""
+        """The module by its new name, which keeps its own spec."""
         module = importlib.import_module(self.new)
         self.spec = module.__spec__
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        """The module was executed under its new name, which it keeps."""
+        """Nothing: the module was executed under its new name."""
         module.__spec__ = self.spec
 
     def get_code(self, name: str) -> Any:
@@ -70,5 +66,5 @@ class _Moved(Loader):
 
 def install() -> None:
     """Let imports find the old names."""
-    if not any(finder is _Moved for finder in sys.meta_path):
+    if _Moved not in sys.meta_path:
         sys.meta_path.insert(0, _Moved)

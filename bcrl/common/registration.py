@@ -1,7 +1,7 @@
 """Our tasks as environments of Gymnasium, registered by strings: `bcrl/Maze-v0` etc.
 
-Importing bcrl must stay light, so Gymnasium isn't imported here: the tasks are
-registered as soon as it has been imported, before or after bcrl.
+Importing bcrl must stay light, so this module does not import Gymnasium: it registers
+the tasks once Gymnasium is imported, before or after bcrl.
 """
 
 from __future__ import annotations

@@ -1,14 +1,15 @@
-"""What is said on the terminal; that nobody reads it any more is no reason to fail."""
+"""Standard streams: closed pipes and odd locales are no reason to fail."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import sys
+from collections.abc import Sequence
+from typing import Any
 
-#: What a closed pipe, terminal or stream may raise.
+#: Errors of a closed pipe, terminal or stream.
 GONE = (OSError, ValueError, AttributeError)
-STREAMS = ("stdin", "stdout", "stderr")  # by file descriptor
 
 
 def ready() -> None:
@@ -17,31 +18,26 @@ def ready() -> None:
     A closed one becomes the null device, or the next file opened would take its
     descriptor. Characters that the locale lacks are printed as escapes.
     """
-    for number, name in enumerate(STREAMS):
-        with contextlib.suppress(OSError):
-            if not _is_open(number):  # the lowest free descriptor, so this one
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            with contextlib.suppress(OSError):  # takes the lowest free descriptor
                 os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
         if getattr(sys, name) is None:
             mode = "w" if number else "r"
-            # By its usual number, which processes that are started take over.
+            # By its usual number, which child processes inherit.
             stream = open(number, mode, encoding="utf-8", closefd=False)  # noqa: SIM115
             setattr(sys, name, stream)
-    for stream in (sys.stdout, sys.stderr):
+    streams: tuple[Any, ...] = (sys.stdout, sys.stderr)
+    for stream in streams:
         with contextlib.suppress(*GONE):  # a stream of a test's or a notebook's
             stream.reconfigure(errors="backslashreplace")
-    # numba can't be imported with another number, and our loops have to be compiled.
+    # numba can't be imported with another number, and our loops must be compiled.
     if not count("NUMBA_NUM_THREADS"):
         os.environ.pop("NUMBA_NUM_THREADS", None)
     if os.environ.pop("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
-        say("bcrl: NUMBA_DISABLE_JIT is ignored: its loops have to be compiled")
-
-
-def _is_open(descriptor: int) -> bool:
-    try:
-        os.fstat(descriptor)
-    except OSError:
-        return False
-    return True
+        say("bcrl: NUMBA_DISABLE_JIT is ignored: bcrl's loops must be compiled")
 
 
 def count(variable: str) -> int | None:
@@ -50,18 +46,28 @@ def count(variable: str) -> int | None:
     return int(value) or None if value.isdecimal() else None
 
 
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Rows as lines: the first column to the left, all others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        row[0].ljust(widths[0])
+        + "".join(f"  {cell:>{w}}" for cell, w in zip(row[1:], widths[1:], strict=True))
+        for row in rows
+    ]
+
+
 def say(text: str) -> None:
-    """A line on standard error."""
+    """Print a line on standard error."""
     with contextlib.suppress(*GONE):
         print(text, file=sys.stderr, flush=True)
 
 
 def show(text: str) -> None:
-    """What was asked for, on standard output, as far as anybody reads it."""
+    """Print a command's result on standard output, as far as anybody reads it."""
     try:
         print(text, flush=True)
     except OSError as error:
         if not isinstance(error, BrokenPipeError):  # a full disk, say
             say(f"bcrl: standard output can't be written: {error.strerror}")
-        # What is still buffered must not fail again at exit.
+        # The rest of the buffer must not fail again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

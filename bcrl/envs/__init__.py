@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import importlib
-import pkgutil
 from collections.abc import Sequence
 
 from bcrl.common import plugins
-from bcrl.envs import _protocol
-from bcrl.envs._success import Success
-from bcrl.envs.base import Env, FiniteEnv, is_finite, is_simulated, lanes_of
+from bcrl.common.registration import REGISTERED
+from bcrl.envs.base import Env, FiniteEnv, Success, is_finite, is_simulated, lanes_of
+from bcrl.envs.checks import check_pure_tasks
 from bcrl.errors import BcrlError, ConfigError, did_you_mean
 
 __all__ = [
@@ -25,41 +24,36 @@ __all__ = [
 ]
 
 
-#: Modules of this package that are no environments.
-PARTS = ("base", "gym_api", "rendering", "tasks")
-
-
 def env_names() -> list[str]:
-    """Names of the environments that this package ships."""
-    found = (module.name for module in pkgutil.iter_modules(__path__))
-    return [name for name in found if name not in PARTS and name[0] != "_"]
+    """Names of the environments in this package: our tasks and `gymnasium`."""
+    return sorted(["gymnasium", *(name for name, _ in REGISTERED.values())])
 
 
 def check_tasks(name: str, tasks: Sequence[Env]) -> None:
-    """Raise ConfigError for tasks that no learner could do with.
+    """Raise ConfigError for tasks that no learner can use.
 
-    Pure environments of this package are tested, the user's own are tried.
+    A user's environments and simulators are tried; tests cover the package's own.
     """
     target = tasks[-1]
     for number, task in enumerate(tasks, start=1):
-        for what in ("state_dim", "n_actions"):
-            here, there = getattr(task, what, None), getattr(target, what, None)
+        for key in ("state_dim", "n_actions"):
+            here, there = getattr(task, key, None), getattr(target, key, None)
             if here != there:
-                why = f"task {number} has {what} {here}, the target {there}; "
+                why = f"task {number} has {key} {here}, the target {there}; "
                 why += "expected the same in all tasks"
-                if is_simulated(target) and what == "state_dim":
-                    why += ": a function env.observation makes them so"
-                raise ConfigError("env.tasks", what, why)
+                if is_simulated(target) and key == "state_dim":
+                    why += ": a function env.observation can make them equal"
+                raise ConfigError("env.tasks", key, why)
     if is_simulated(target):
         target.check_tasks(tasks)
     elif name not in env_names():
-        _protocol.check_tasks(name, tasks)
+        check_pure_tasks(name, tasks)
 
 
 def env_class(name: str) -> type:
     """The environment class called `name`; BcrlError if there is none.
 
-    Others are modules of the user's own, as BCRL_TRUST allows.
+    BCRL_TRUST lists the user's modules, where `name` may lie, too.
     """
     if plugins.is_foreign(name, env_names()):
         return plugins.component("env.name", name, f"{name}.ENV")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from numbers import Integral
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeGuard, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,156 +13,155 @@ from numpy.typing import NDArray
 from bcrl.common.serialization import storable
 from bcrl.errors import ConfigError
 
-Step = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]
+Floats = NDArray[np.float64]
+Ints = NDArray[np.integer]
+Bools = NDArray[np.bool_]
+Step = tuple[
+    Floats, Floats, Bools
+]  # next state (..., d), reward (...), absorbing (...)
+
+#: Rules by which an episode counts as solved: docs/reference/gymnasium.md.
+RULES = ("absorbed", "survived", "unpunished", "rewarded", "threshold", "info")
+
+
+class Success(NamedTuple):
+    """One of RULES; `threshold` is the return that the rule `threshold` needs."""
+
+    rule: str = "unpunished"
+    threshold: float = 0.0
 
 
 class Env(Protocol):
     """One task, as a frozen dataclass whose fields are its constants.
 
     Arrays may have any leading axes (seeds, episodes); `d` is `state_dim`, `A` is
-    `n_actions`. Noise is drawn by the caller, uniform on [0, 1).
+    `n_actions`. The caller draws the noise, uniform on [0, 1).
     """
 
     name: ClassVar[str]
     n_actions: ClassVar[int]
     state_dim: ClassVar[int]
-    initial_noise: ClassVar[int]  # uniforms that `initial` takes a state
-    step_noise: ClassVar[int]  # uniforms that `step` takes a state
-    actions: ClassVar[NDArray[np.float64]]  # (A, k) what each action does, as a vector
+    initial_noise: ClassVar[int]  # uniforms that `initial` takes per state
+    step_noise: ClassVar[int]  # uniforms that `step` takes per state
+    actions: ClassVar[Floats]  # (A, k) the vector that each action applies
     gamma: float  # discount factor
     horizon: int  # steps after which an episode is cut (not absorbing)
 
-    def initial(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __hash__(self) -> int:
+        """Equal constants have equal hashes."""
+
+    def initial(self, noise: Floats) -> Floats:
         """Start states (..., d) from noise (..., initial_noise)."""
 
-    def step(
-        self,
-        state: NDArray[np.float64],
-        action: NDArray[np.integer],
-        noise: NDArray[np.float64] | None = None,
-    ) -> Step:
+    def step(self, state: Floats, action: Ints, noise: Floats | None = None) -> Step:
         """Next state (..., d), reward (...) and whether it is absorbing (...)."""
 
-    def evaluation_states(self) -> NDArray[np.float64]:
+    def evaluation_states(self) -> Floats:
         """States (n, d) from which the greedy policy is evaluated."""
 
 
 class ContinuousEnv(Env, Protocol):
-    """An env that takes any vector as its action; LSPI learns in its LQ tasks."""
+    """An environment that takes any vector as its action; LSPI learns in LQ tasks."""
 
     positions: ClassVar[tuple[int, ...]]  # which entry of the state each force moves
 
     @property
-    def linear_quadratic(self) -> tuple[NDArray[np.float64], ...] | None:
+    def linear_quadratic(self) -> tuple[Floats, ...] | None:
         """A, B, Q, R of s' = A s + B a, reward −s'ᵀ Q s' − aᵀ R a; None if not so."""
 
-    def push(
-        self,
-        state: NDArray[np.float64],
-        force: NDArray[np.float64],
-        noise: NDArray[np.float64],
-    ) -> Step:
+    def push(self, state: Floats, force: Floats, noise: Floats) -> Step:
         """`step` with actions (..., k)."""
 
 
 class FiniteEnv(Env, Protocol):
-    """A deterministic env that lists its states: its Q is a table, shape (N, A)."""
+    """A deterministic environment that lists its states: its Q is a table (N, A)."""
 
     finite: bool  # whether the dynamics stay on the listed states
 
-    def states(self) -> NDArray[np.float64]:
+    def states(self) -> Floats:
         """All states, shape (N, d)."""
 
-    def index(self, state: NDArray[np.float64]) -> NDArray[np.intp]:
+    def index(self, state: Floats) -> NDArray[np.intp]:
         """Row of each state (..., d) in `states()`."""
 
 
 class Lanes(Protocol):
-    """Episodes of one env side by side, one per lane, in arrays of any leading axes."""
+    """Episodes of one environment side by side, one per lane; any leading axes."""
 
-    #: Lanes whose simulator failed, counted in C order, and why. Such a lane gives
-    #: zeros and is cut at every step; the others don't notice.
-    failures: dict[int, str]
+    @property
+    def failures(self) -> dict[int, str]:
+        """Why a lane's simulator failed, by the lane's number in C order.
 
-    def begin(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The states (…, d) of lanes that start as `initial` says."""
+        Such a lane gives zeros and is cut at every step; other lanes are not affected.
+        """
+
+    def begin(self, start: Floats) -> Floats:
+        """Observations (..., d) of lanes that start as `initial` says."""
 
     def step(
-        self,
-        state: NDArray[np.float64],
-        action: NDArray,
-        noise: NDArray[np.float64],
-        lanes: Any = ...,
+        self, state: Floats, action: NDArray, noise: Floats, lanes: Any = ...
     ) -> tuple[NDArray, NDArray, NDArray, NDArray | bool]:
-        """A step of the lanes chosen: as `Env.step`, and where an episode is cut."""
+        """`Env.step` in the chosen lanes, and where an episode is cut."""
 
-    def restart(
-        self,
-        over: NDArray[np.bool_],
-        start: NDArray[np.float64],
-        state: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
-        """All states, anew from `start` in the lanes that are over."""
+    def restart(self, over: Bools, start: Floats, state: Floats) -> Floats:
+        """All states; lanes that are over begin again from `start`."""
 
     def close(self) -> None:
-        """Free what the lanes hold; they end here."""
+        """Free the lanes' resources; the lanes end here."""
 
 
 class SimulatedEnv(Env, Protocol):
-    """An env that keeps its state to itself: only whole episodes can be had of it.
+    """An environment with a hidden state, which only runs whole episodes.
 
-    `initial` gives what a lane is reset by, `state`s are observations, and noise is the
-    simulator's own, from the reset on.
+    `initial` gives the numbers that reset a lane, each `state` is an observation. The
+    simulator draws its own noise, seeded by the reset.
     """
 
-    starts: int  # random resets that FQI's greedy policy is evaluated from
+    starts: int  # random resets from which FQI's greedy policy is evaluated
 
     def lanes(self) -> Lanes:
-        """Simulators to be stepped side by side."""
+        """Simulators side by side."""
 
     def check_tasks(self, tasks: Sequence[Env]) -> None:
-        """Raise ConfigError for tasks that are alike, or don't repeat themselves."""
+        """Raise ConfigError for tasks that are alike or not reproducible."""
 
 
 @storable
 @dataclass(frozen=True)
 class PureLanes:
-    """Lanes of an env whose steps are pure functions: the caller has the states."""
+    """Lanes of an environment whose steps are pure functions of the caller's states."""
 
     env: Env
     failures: ClassVar[dict[int, str]] = {}
 
-    def begin(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
+    def begin(self, start: Floats) -> Floats:
         """The start states themselves."""
         return start
 
     def step(
-        self,
-        state: NDArray[np.float64],
-        action: NDArray,
-        noise: NDArray[np.float64],
-        lanes: Any = ...,
+        self, state: Floats, action: NDArray, noise: Floats, lanes: Any = ...
     ) -> tuple[NDArray, NDArray, NDArray, NDArray | bool]:
-        """`step` for actions (…), `push` for forces (…, k); never cut."""
-        step = self.env.push if action.ndim == state.ndim else self.env.step
+        """`step` for actions (...), `push` for forces (..., k); never cut."""
+        forces = action.ndim == state.ndim
+        step = cast(ContinuousEnv, self.env).push if forces else self.env.step
         return *step(state, action, noise), False
 
-    def restart(
-        self,
-        over: NDArray[np.bool_],
-        start: NDArray[np.float64],
-        state: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
+    def restart(self, over: Bools, start: Floats, state: Floats) -> Floats:
         """The start states where it is over."""
         return np.where(over[..., None], start, state)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Nothing to free."""
 
 
-def is_simulated(env: Env) -> bool:
+def is_simulated(env: Env) -> TypeGuard[SimulatedEnv]:
     """Whether `env` is a SimulatedEnv."""
     return hasattr(env, "lanes")
+
+
+def is_finite(env: Env) -> TypeGuard[FiniteEnv]:
+    """Whether `env` is a FiniteEnv whose Q can be tabulated."""
+    return getattr(env, "finite", False) and env.step_noise == 0
 
 
 def lanes_of(env: Env) -> Lanes:
@@ -173,10 +173,5 @@ def check_episodes(gamma: float, horizon: int) -> None:
     """Raise ConfigError for a discount outside [0, 1) or a horizon below 1."""
     if not 0.0 <= gamma < 1.0:
         raise ConfigError("env.gamma", gamma, "must lie in [0, 1)")
-    if horizon < 1:
-        raise ConfigError("env.horizon", horizon, "must be at least 1 step")
-
-
-def is_finite(env: Env) -> bool:
-    """Whether `env` is a FiniteEnv whose Q can be tabulated."""
-    return getattr(env, "finite", False) and env.step_noise == 0
+    if not isinstance(horizon, Integral) or horizon < 1:
+        raise ConfigError("env.horizon", horizon, "must be an integer ≥ 1 (steps)")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.common.compiling import kept
-from bcrl.envs.base import Step, check_episodes
+from bcrl.envs.base import Floats, Ints, Step, check_episodes
 from bcrl.errors import ConfigError
 
 FORCE = 4.0  # N, to the left (action 0) or to the right (action 1)
@@ -20,12 +20,12 @@ SUBSTEPS = 6  # Runge-Kutta steps a force is held for; error below 1e-7
 MAX_POSITION = 1.0  # m
 MAX_SPEED = 3.0  # m/s
 GRID = 10  # evaluation states along each axis
-START = (-0.5, 0.0)  # m, m/s: at rest in the valley
+_START = (-0.5, 0.0)  # m, m/s: at rest in the valley
 
 
 @dataclass(frozen=True)
 class CarOnHill:
-    """Drive a car over the hill's right end without overspeeding or rolling off left.
+    """Drive a car over the hill's right end; not too fast, and not off the left end.
 
     | | |
     |---|---|
@@ -35,13 +35,13 @@ class CarOnHill:
     | | h''(p) = 2 if p < 0, else −15p (1 + 5p²)^(−5/2): a jump at p = 0 |
     | dynamics | dp/dt = v; dv/dt = (u − g m h' − v² m h' h'') / (m (1 + h'²)) |
     | reward | +1 if p > 1 and \\|v\\| ≤ 3; −1 if p < −1 or \\|v\\| > 3; else 0 |
-    | absorbing | whenever the reward is not 0; judged at the end of the 0.1 s |
+    | absorbing | if the reward is not 0; only the state after 0.1 s counts |
     | start | (−0.5, 0); episodes are cut after 100 steps |
     | source | Ernst, Geurts & Wehenkel (2005); Klink et al. (2022), C.1 |
 
-    `mass` m [kg] is the task parameter, `gamma` the discount a step, `horizon` counts
-    steps. A state outside the bounds is a place one has left: it stays, with reward 0.
-    Raises ConfigError for mass ≤ 0, γ outside [0, 1) or a horizon below 1.
+    `mass` m [kg] is the task parameter, `gamma` the discount per step, `horizon` counts
+    steps. A state outside the bounds never changes again and gives reward 0. Raises
+    ConfigError for mass ≤ 0, γ outside [0, 1) or a horizon below 1.
     """
 
     mass: float = 1.0
@@ -53,7 +53,7 @@ class CarOnHill:
     state_dim: ClassVar[int] = 2
     initial_noise: ClassVar[int] = 0
     step_noise: ClassVar[int] = 0
-    actions: ClassVar[NDArray[np.float64]] = np.array([[-FORCE], [FORCE]])
+    actions: ClassVar[Floats] = np.array([[-FORCE], [FORCE]])
 
     def __post_init__(self) -> None:
         if not 0.0 < self.mass < math.inf:
@@ -61,11 +61,11 @@ class CarOnHill:
         check_episodes(self.gamma, self.horizon)
 
     @property
-    def bounds(self) -> NDArray[np.float64]:
-        """What holds every state that can be arrived at, lost or won too, (2, 2).
+    def bounds(self) -> Floats:
+        """The lowest and the highest states that a step can lead to, (2, 2).
 
-        |dv/dt| ≤ c + v² with c = u/m + g/2, and then v grows like a tangent; a car so
-        light that this gets infinite within a step has none.
+        |dv/dt| ≤ c + v² with c = u/m + g/2, so v grows at most like a tangent. They are
+        infinite for a car so light that the tangent is infinite within a step.
         """
         root = math.sqrt(FORCE / self.mass + GRAVITY / 2.0)
         angle = math.atan(MAX_SPEED / root) + root * STEP_TIME
@@ -73,19 +73,13 @@ class CarOnHill:
         high = np.array([MAX_POSITION + STEP_TIME * speed, speed])
         return np.stack([-high, high])
 
-    def initial(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    def initial(self, noise: Floats) -> Floats:
         """The valley (−0.5, 0) for noise of shape (..., 0)."""
-        return np.broadcast_to(np.array(START), (*noise.shape[:-1], 2)).copy()
+        return np.broadcast_to(np.array(_START), (*noise.shape[:-1], 2)).copy()
 
-    def step(
-        self,
-        state: NDArray[np.float64],
-        action: NDArray[np.integer],
-        noise: NDArray[np.float64] | None = None,
-    ) -> Step:
+    def step(self, state: Floats, action: Ints, noise: Floats | None = None) -> Step:
         """Hold a force for 0.1 s; IndexError for an action other than 0 and 1."""
-        state = np.asarray(state, dtype=np.float64)
-        action = np.asarray(action)
+        state, action = np.asarray(state, np.float64), np.asarray(action)
         shape = state.shape[:-1]
         if action.shape != shape:
             shape = np.broadcast_shapes(shape, action.shape)
@@ -94,13 +88,10 @@ class CarOnHill:
         flat = np.ascontiguousarray(state).reshape(-1, 2)
         force = np.ascontiguousarray(action, dtype=np.int64).reshape(-1)
         after, reward, absorbing = _steps(flat, force, self.mass)
-        return (
-            after.reshape(*shape, 2),
-            reward.reshape(shape),
-            absorbing.reshape(shape),
-        )
+        after = after.reshape(*shape, 2)
+        return after, reward.reshape(shape), absorbing.reshape(shape)
 
-    def evaluation_states(self) -> NDArray[np.float64]:
+    def evaluation_states(self) -> Floats:
         """A 10 × 10 grid over the bounds, position-major, shape (100, 2)."""
         p = np.linspace(-MAX_POSITION, MAX_POSITION, GRID)
         v = np.linspace(-MAX_SPEED, MAX_SPEED, GRID)
@@ -170,8 +161,8 @@ def _cross(
     """(p, v, seconds used) at p = 0, or after `dt` if the branch is not left.
 
     The parabola's exit time is corrected by Newton steps for as long as they land
-    nearer to 0: where the car barely turns at 0 they need not, and need not be exact,
-    since the branches differ by v² there.
+    nearer to 0: where the car barely turns at 0 they need not, and an error there is
+    small, since the branches differ by v².
     """
     t = _exit_time(p, v, _acceleration(p, v, pull, left), left)
     t = max(0.0, min(t, dt))
@@ -190,7 +181,7 @@ def _cross(
 
 @kept(nogil=True, error_model="numpy")
 def _advance(p: float, v: float, pull: float) -> tuple[float, float]:
-    """(p, v) after 0.1 s under `pull` = u / m [m/s²], whatever the bounds.
+    """(p, v) after 0.1 s under `pull` = u / m [m/s²], bounds ignored.
 
     A fixed step over the jump of h'' at p = 0 would be off by its length, so every step
     that crosses is cut there and continued on the other branch.
@@ -229,10 +220,8 @@ def _outcome(p: float, v: float) -> float:
 
 
 @kept(nogil=True, error_model="numpy")
-def _steps(
-    state: NDArray[np.float64], action: NDArray[np.int64], mass: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """`CarOnHill.step` on states (n, 2) and actions (n,), each lane by itself."""
+def _steps(state: Floats, action: NDArray[np.int64], mass: float) -> Step:
+    """`CarOnHill.step` on states (n, 2) and actions (n,), lane by lane."""
     after = np.empty_like(state)
     reward = np.zeros(len(state))
     absorbing = np.ones(len(state), dtype=np.bool_)

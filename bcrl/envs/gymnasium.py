@@ -3,29 +3,44 @@
 from __future__ import annotations
 
 import functools
+import itertools
+import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
-from itertools import pairwise
-from numbers import Integral, Real
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bcrl.common import plugins
-from bcrl.envs import _simulators as simulators
-from bcrl.envs._contract import Simulator, plain_parts
-from bcrl.envs._lanes import SimulatedLanes
-from bcrl.envs._success import RULES, default
-from bcrl.envs._trial import FRESH, TRIES, once, trial
-from bcrl.envs.base import check_episodes
-from bcrl.errors import BcrlError, ConfigError, at_least, did_you_mean
+from bcrl.common.checks import one_of
+from bcrl.envs._recipe import Recipe, spec_of
+from bcrl.envs.base import RULES, Floats, Ints, check_episodes
+from bcrl.envs.checks import (
+    check_different,
+    described,
+    note_resolution,
+    once,
+    unresolved,
+)
+from bcrl.envs.simulators import (
+    SimulatedLanes,
+    Simulator,
+    is_plain,
+    reset_seed,
+    shortened,
+)
+from bcrl.errors import BcrlError, ConfigError, at_least
 
-MOST = 2**15 - 1  # actions, kept as int16
-RESCALE = "rescale: env.wrappers=[{name: RescaleObservation, min_obs: -1, max_obs: 1}]"
-RESCALE += " where the Box has bounds, else env.observation=module.function"
+_TRIES = 5  # random episodes that are played in every task before any work,
+_STEPS = 10_000  # with so many steps altogether
+_SECONDS = 5.0  # and for so long
+_KEPT = 4_000_000  # numbers of their observations, to see how fine they are
+_MOST_ACTIONS = 2**15 - 1  # kept as int16
+_RESCALE = (
+    "rescale: env.wrappers=[{name: RescaleObservation, min_obs: -1, max_obs: 1}] "
+    "where the Box has bounds, else env.observation=module.function"
+)
 
 
 @dataclass(frozen=True)
@@ -34,273 +49,306 @@ class Gymnasium:
 
     | | |
     |---|---|
-    | observation | the Box, Discrete, Tuple or Dict …, flattened; or what `observation`, a function `module.name` that is trusted, makes of an observation |
+    | observation | the space's members, flattened; or the values of `observation`, a trusted function `module.name`, for them |
     | actions | the Discrete space's, counted from 0 |
-    | dynamics | the environment's own; its randomness follows from the seed of each reset |
+    | dynamics | the environment's; each reset gets a seed for all randomness |
     | absorbing | terminated; truncated by a wrapper is cut, as at the horizon |
     | horizon | `horizon` steps, else the registered `max_episode_steps` |
-    | success | `success` names the rule: absorbed, survived, unpunished, rewarded, threshold (`success_threshold`, else the registered one) or info; `auto` chooses by random play |
+    | success | the rule `success`: absorbed, survived, unpunished, rewarded, threshold (`success_threshold`, else the registered one) or info; `auto` chooses by random play |
 
     Tasks differ in `kwargs` of the constructor, in `attributes` set on the unwrapped
     environment, in `wrappers` ({name: …, arguments}) or in any other field.
-    `starts` episodes measure each FQI iteration. `action_vectors` (A, k) say what each
-    action does, which residual policies want to know. `verify=False` allows tasks that
-    random play can't tell apart. Raises ConfigError for whatever of it can't be.
+    `starts` episodes measure each FQI iteration. `action_vectors` (A, k) are needed by
+    residual policies. `verify=False` accepts tasks that behave alike or that differ
+    when they are repeated. Raises BcrlError for a wrong field or a broken simulator.
     """  # noqa: E501
 
     id: str
-    kwargs: Any = None
-    attributes: Any = None
-    wrappers: Any = None
-    observation: Any = None
+    kwargs: dict[str, Any] | None = None
+    attributes: dict[str, Any] | None = None
+    wrappers: list[Any] | None = None
+    observation: str | None = None
     gamma: float = 0.99
-    horizon: Any = None
+    horizon: int | None = None
     success: str = "auto"
-    success_threshold: Any = None
+    success_threshold: float | None = None
     starts: int = 20
-    action_vectors: Any = None
+    action_vectors: list[list[float]] | None = None
     verify: bool = True
 
     name: ClassVar[str] = "gymnasium"
-    # n_actions, state_dim and first_action (what the simulator calls action 0) are
-    # set from a simulator's spaces and its first observation.
     initial_noise: ClassVar[int] = 1  # the seed of a reset
     step_noise: ClassVar[int] = 0
+    # Every task gets its own values of these from its random episodes.
+    trial: ClassVar[Trial]
+    n_actions: ClassVar[int]
+    state_dim: ClassVar[int]
+    fresh: ClassVar[bool]  # whether every episode needs a new simulator
 
     def __post_init__(self) -> None:
         at_least("env.starts", self.starts, 1)
-        for key, kind in (("kwargs", dict), ("attributes", dict), ("wrappers", list)):
-            value = getattr(self, key)
-            if not isinstance(value, (kind, type(None))):
-                noun = "names and values" if kind is dict else "a list of sections"
-                raise ConfigError(f"env.{key}", value, f"must be {noun}, or null")
-        spec = simulators.spec_of(self.id)
+        spec = spec_of(self.id)
         horizon = self.horizon
         if horizon is None and (horizon := spec.max_episode_steps) is None:
-            why = f"is needed: {self.id} has no limit of its own (a number of steps)"
+            why = f"is needed: {self.id} is registered without a number of steps"
             raise ConfigError("env.horizon", None, why)
-        if not isinstance(horizon, Integral) or isinstance(horizon, bool):
-            raise ConfigError("env.horizon", horizon, "must be an integer, or null")
-        object.__setattr__(self, "horizon", horizon := int(horizon))
         check_episodes(self.gamma, horizon)
-        self._resolve_success(spec.reward_threshold)
-        for name, value in _facts(_measured(self)).items():
-            object.__setattr__(self, name, value)
-        if self.action_vectors is not None:
-            self._check_vectors()
+        seen = trial(self.recipe, horizon, self.verify)
+        rule, threshold = self._success(spec.reward_threshold, seen)
+        derived = {"horizon": horizon, "success": rule, "success_threshold": threshold}
+        derived |= {"trial": seen, "n_actions": seen.n_actions}
+        derived |= {"state_dim": seen.state_dim, "fresh": seen.fresh}
+        for key, value in derived.items():
+            object.__setattr__(self, key, value)
+        if (vectors := self.action_vectors) is not None:
+            lengths = {len(vector) for vector in vectors}
+            if len(vectors) != seen.n_actions or len(lengths) != 1 or 0 in lengths:
+                why = f"must be {seen.n_actions} vectors of one length, one per action"
+                raise ConfigError("env.action_vectors", vectors, why)
 
-    def _resolve_success(self, registered: float | None) -> None:
-        """Name the rule of `auto`, and the threshold of the rule that needs one."""
+    def _success(
+        self, registered: float | None, seen: Trial
+    ) -> tuple[str, float | None]:
+        """The rule, chosen if it is `auto`, and the threshold of `threshold`."""
         rule, threshold = self.success, self.success_threshold
-        if rule not in (*RULES, "auto"):
-            why = did_you_mean(str(rule), (*RULES, "auto"))
-            raise ConfigError("env.success", rule, why)
+        one_of("env.success", rule, (*RULES, "auto"))
         if threshold is not None:
-            number = isinstance(threshold, Real) and not isinstance(threshold, bool)
-            if not number or not np.isfinite(threshold):
-                why = "must be a number, the return that counts as solved, or null"
-                raise ConfigError("env.success_threshold", threshold, why)
             if rule not in ("auto", "threshold"):
                 why = f"has no effect with env.success={rule}; env.success=threshold"
                 raise ConfigError("env.success_threshold", threshold, why)
-            rule = "threshold"
-        elif rule == "threshold":
-            if (threshold := registered) is None:
-                why = f"is needed: {self.id} is registered without one (a return)"
-                raise ConfigError("env.success_threshold", None, why)
-        elif rule == "auto":
-            seen = trial(_measured(self))
-            found = default(seen.reports, seen.low, seen.high, registered)
-            rule, threshold = found
-            once(f"env.id={self.id}: solved is env.success={found}")
-        threshold = None if rule != "threshold" else float(threshold)
-        object.__setattr__(self, "success", rule)
-        object.__setattr__(self, "success_threshold", threshold)
-
-    def _check_vectors(self) -> None:
-        try:
-            vectors = np.array(self.action_vectors, float)
-            fits = vectors.ndim == 2 and len(vectors) == self.n_actions
-            fits = fits and vectors.size > 0 and np.isfinite(vectors).all()
-        except (TypeError, ValueError):
-            fits = False
-        if not fits:
-            why = f"must be {self.n_actions} vectors of one length, one per action"
-            raise ConfigError("env.action_vectors", self.action_vectors, why)
+            return "threshold", float(threshold)
+        if rule == "auto":
+            rule = default_success(seen.reports, seen.low, seen.high, registered)
+            value = f" (a return of {registered})" if rule == "threshold" else ""
+            once(f"env.id={self.id}: an episode is solved if env.success={rule}{value}")
+        if rule != "threshold":
+            return rule, None
+        if registered is None:
+            why = f"is needed: {self.id} is registered without one (a return)"
+            raise ConfigError("env.success_threshold", None, why)
+        return rule, float(registered)
 
     def __hash__(self) -> int:
-        return hash((self.id, self.horizon, self.gamma))  # dicts have none
-
-    def __reduce__(self) -> tuple:
-        return _made, (_fields(self), self.fresh)  # what is cached stays here
+        return hash((self.id, self.horizon, self.gamma))  # dicts have no hash
 
     @property
-    def fresh(self) -> bool:
-        """Whether every episode needs a new simulator, as random play has shown."""
-        return _measured(self) in FRESH
+    def recipe(self) -> Recipe:
+        """How a simulator of this task is made."""
+        parts = self.kwargs or {}, self.attributes or {}, tuple(self.wrappers or ())
+        return Recipe(self.id, *parts, self.observation)
 
     @property
-    def actions(self) -> NDArray[np.float64] | None:
+    def actions(self) -> Floats | None:
         """`action_vectors` as an array (A, k)."""
         vectors = self.action_vectors
         return None if vectors is None else np.array(vectors, np.float64)
 
-    def simulator(self, render_mode: str | None = None) -> gymnasium.Env:
-        """A new environment of this task, without a time limit."""
-        parts = self.kwargs or {}, self.attributes or {}, self.wrappers or []
-        return simulators.made(self.id, *parts, render_mode)
-
-    def pictures(
-        self, start: NDArray[np.float64], actions: NDArray[np.integer]
-    ) -> Iterator[NDArray[np.uint8]]:
-        """The environment's own pictures of an episode, one more than actions.
-
-        BcrlError if it draws none.
-        """
-        lanes = SimulatedLanes(self, render_mode="rgb_array")
-        try:
-            lanes.begin(start[None])
-            yield self._picture(lanes)
-            for action in actions:
-                lanes.step(None, action[None], None)
-                yield self._picture(lanes)
-        finally:
-            lanes.close()
-
-    def _picture(self, lanes: SimulatedLanes) -> NDArray[np.uint8]:
-        for why in lanes.failures.values():
-            raise BcrlError(why)
-        try:
-            return lanes.running[0].env.render()
-        except Exception as error:  # of foreign code
-            text = "pip install 'boosted-curriculum-rl[rendering]' may be what it needs"
-            why = f"{type(error).__name__} {error}".strip()
-            raise BcrlError(f"{self.id} draws nothing ({why}); {text}") from error
-
-    @functools.cached_property
-    def map(self) -> Any:
-        """The function `observation`."""
-        name = str(self.observation)
-        return plugins.attribute("env.observation", name, name)
-
-    def initial(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What lanes are reset by: the noise (…, 1) itself."""
+    def initial(self, noise: Floats) -> Floats:
+        """The numbers that reset lanes: the noise (..., 1) itself."""
         return noise
 
     def lanes(self) -> SimulatedLanes:
         """Simulators side by side."""
         return SimulatedLanes(self)
 
-    def evaluation_states(self) -> NDArray[np.float64]:
+    def evaluation_states(self) -> Floats:
         """Observations after `starts` resets, always the same ones, (starts, d)."""
-        numbers = (np.arange(self.starts) + 0.5) / self.starts
-        lanes, found = SimulatedLanes(self), []  # one simulator is enough
+        simulator = Simulator(self.recipe, self.state_dim, self.fresh)
         try:
-            for number in numbers:
-                found.append(lanes.begin(np.full((1, 1), number))[0])
-                for why in lanes.failures.values():
-                    raise BcrlError(why)
+            numbers = (np.arange(self.starts) + 0.5) / self.starts
+            return np.array([simulator.reset(reset_seed(each)) for each in numbers])
         finally:
-            lanes.close()
-        return np.array(found)
+            simulator.close()
+
+    def pictures(self, start: Floats, actions: Ints) -> Iterator[NDArray[np.uint8]]:
+        """The environment's own pictures of an episode, one more than actions.
+
+        BcrlError if it draws none.
+        """
+        simulator = Simulator(self.recipe, self.state_dim, render_mode="rgb_array")
+        try:
+            simulator.reset(reset_seed(start[0]))
+            for action in [*actions.tolist(), None]:
+                picture: Any = simulator.env.render()
+                yield picture
+                if action is not None:
+                    simulator.step(action)
+        except Exception as error:  # of foreign code
+            hint = "it may need pip install 'boosted-curriculum-rl[rendering]'"
+            why = f"{self.id} draws no picture ({described(error)}); {hint}"
+            raise BcrlError(why) from error
+        finally:
+            simulator.close()
 
     @staticmethod
     def check_tasks(tasks: Sequence[Gymnasium]) -> None:
-        """Raise BcrlError for tasks that are alike, or that break the contract.
+        """Raise ConfigError for tasks that are alike or not reproducible.
 
-        Notes say what is adapted, and what float32 does not resolve.
+        Notes name answers that were converted, and components too fine for float32.
         """
-        trials = [trial(_measured(task)) for task in tasks]
-        for task, seen in zip(tasks, trials, strict=True):
+        for task in tasks:
+            seen, key = task.trial, f"env.id={task.id}"
             if seen.unsteady:
-                why = f"{seen.unsteady} is another after the same reset and actions; "
+                why = f"{seen.unsteady} differs after the same reset and actions; "
                 why += "expected the same each time: randomness from reset(seed=…) "
                 why += "only, no state that outlives a reset or that simulators share"
                 raise ConfigError("env.id", task.id, why)
             if seen.adapted:
-                once(f"env.id={task.id}: {'; '.join(seen.adapted)}")
-            if seen.coarse:
-                more = len(seen.coarse) - 1
-                text = f"{seen.coarse[0]}{f' ({more} more like it)' * (more > 0)}"
-                once(f"env.id={task.id}: {text}; {RESCALE}")
-        for number, (task, after) in enumerate(pairwise(tasks), start=1):
-            one, other = trials[number - 1 : number + 1]
-            same = (task.horizon, task.gamma) == (after.horizon, after.gamma)
-            if tasks[-1].verify and same and not one.differs(other):
-                why = f"tasks {number} and {number + 1} behave alike in {TRIES} "
-                why += "episodes of random play, so what differs may not be applied "
-                why += "(env.verify=false if that is as it should be)"
-                raise ConfigError("env.tasks", _difference(task, after), why)
+                once(f"{key}: {'; '.join(seen.adapted)}")
+            note_resolution(key, seen.coarse, _RESCALE)
+        if tasks[-1].verify:
+            traces = [task.trial.trace for task in tasks]
+            check_different(tasks, traces, _TRIES, "env.verify=false")
 
 
-def _difference(one: Gymnasium, other: Gymnasium) -> str:
-    if one == other:
-        return "the same twice"
-    a, b = _fields(one), _fields(other)
-    return ", ".join(f"{key}: {a[key]} → {b[key]}" for key in a if a[key] != b[key])
+@dataclass(frozen=True)
+class Trial:
+    """What a simulator's spaces and random episodes have shown."""
 
-
-def _fields(task: Gymnasium) -> dict[str, Any]:
-    """All that a task is made from."""
-    return {f.name: getattr(task, f.name) for f in fields(task)}
-
-
-def _measured(task: Gymnasium) -> Gymnasium:
-    """The task without what does not show in its episodes."""
-    plain = {"success": "absorbed", "success_threshold": None, "action_vectors": None}
-    plain |= {"gamma": 0.0, "starts": 1}
-    if all(getattr(task, key) == value for key, value in plain.items()):
-        return task
-    return replace(task, **plain)
+    n_actions: int
+    state_dim: int
+    trace: list[tuple[int, ...]]  # per step, a digest of each episode
+    unsteady: str  # the step that differed when repeated; empty if none did
+    fresh: bool  # whether episodes repeat themselves in new simulators only
+    adapted: list[str]  # notes about answers that were converted
+    coarse: list[str]  # notes about components that float32 does not resolve
+    reports: bool  # whether info has a success key
+    low: float  # least and largest reward of the steps that did not terminate
+    high: float
 
 
 @functools.lru_cache(maxsize=256)
-def _facts(task: Gymnasium) -> dict[str, int]:
-    """What a simulator's spaces and first observation say of a task."""
-    simulator = Simulator(task)
+def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
+    """Play random episodes side by side and, to `verify`, the same ones in turn.
+
+    Raises BcrlError for the first answer that breaks Gymnasium's contract.
+    """
+    first = Simulator(recipe)
+    simulators = [first]
+    trace: list[tuple[int, ...]] = []
+    seen: list[Floats] = []
+    rewards: list[float] = []
     try:
-        space, actions = simulator.space, simulator.actions
-        if not isinstance(actions, spaces.Discrete):
-            why = f"has actions {actions}, only Discrete ones can be learned; "
-            why += (
-                "env.wrappers=[{name: DiscretizeAction, bins: 5}]"
-                * isinstance(actions, spaces.Box)
-                or "a wrapper of your own can number them"
-            )
-            raise ConfigError("env.id", task.id, why)
-        if not 1 <= actions.n <= MOST:
-            why = f"has {actions.n} actions, from 1 to {MOST} can be learned"
-            raise ConfigError("env.id", task.id, why)
-        if not isinstance(space, spaces.Space):
-            came = f"{space!r} of type {type(space).__module__}.{type(space).__name__}"
-            raise simulator.broken("observation_space", came, "a space of gymnasium's")
-        if task.observation is None and not plain_parts(space):
-            raise ConfigError("env.id", task.id, _no_vector(task, space))
-        seen = simulator.reset(seed=0)
+        n_actions = _checked_actions(first)
+        simulators += [Simulator(recipe) for _ in range(_TRIES - 1)]
+        steps = min(horizon, _STEPS // _TRIES)
+        actions = np.random.default_rng(0).integers(n_actions, size=(steps, _TRIES)).T
+        played = map(_episode, simulators, itertools.count(), actions.tolist())
+        deadline = time.monotonic() + _SECONDS
+        for outcomes in itertools.zip_longest(*played):
+            running = [outcome for outcome in outcomes if outcome]
+            if len(seen) * first.state_dim < _KEPT:
+                seen += [state for state, *_ in running]
+            if trace:
+                rewards += [reward for _, reward, ended, _ in running if not ended]
+            trace.append(tuple(map(_digest, outcomes)))
+            if time.monotonic() > deadline:
+                break
+    finally:
+        for simulator in simulators:
+            simulator.close()
+    adapted = []
+    if recipe.observation is None and not isinstance(first.space, spaces.Box):
+        note = f"observations, {shortened(first.space)}, are flattened to "
+        adapted.append(f"{note}{first.state_dim} numbers, as by FlattenObservation")
+    unsteady = _unsteady(recipe, actions, trace, False) if verify else ""
+    fresh = bool(unsteady) and not _unsteady(recipe, actions, trace, True)
+    if fresh:
+        adapted.append("a reset leaves something behind, so each episode has a new one")
+    return Trial(
+        n_actions,
+        first.state_dim,
+        trace,
+        "" if fresh else unsteady,
+        fresh,
+        adapted,
+        unresolved(np.array(seen)),
+        any(simulator.reports for simulator in simulators),
+        min(rewards, default=0.0),
+        max(rewards, default=0.0),
+    )
+
+
+def default_success(
+    reports: bool, low: float, high: float, threshold: float | None
+) -> str:
+    """The rule of `env.success` that suits the rewards of random play.
+
+    `reports`: info has a success key. `low`, `high`: least and largest reward of the
+    steps that did not terminate. `threshold`: the registered `reward_threshold`.
+    """
+    if reports:
+        return "info"
+    if low == high:  # every step costs the same, pays the same, or gives 0
+        return "absorbed" if low < 0 else "survived" if low > 0 else "rewarded"
+    if threshold is not None and not high < 0 < threshold:
+        return "threshold"
+    if threshold is None and high < 0:
+        return "absorbed"
+    return "survived" if low > 0 else "rewarded"
+
+
+def _episode(simulator: Simulator, number: int, actions: list[int]) -> Iterator[tuple]:
+    """Observation, reward, terminated, truncated after the reset and each step."""
+    yield simulator.reset(reset_seed((number + 0.5) / _TRIES)), 0.0, False, False
+    for action in actions:
+        state, reward, ended, cut, _ = simulator.step(action)
+        yield state, reward, ended, cut
+        if ended or cut:
+            return
+
+
+def _digest(outcome: tuple | None) -> int:
+    return hash(outcome and (outcome[0].tobytes(), *outcome[1:]))
+
+
+def _unsteady(recipe: Recipe, actions: NDArray, trace: list, fresh: bool) -> str:
+    """The step at which an episode differs when one simulator, or `fresh` ones, play.
+
+    So randomness without a seed is found, and state that outlives a reset or that
+    simulators share. Empty if all episodes repeat themselves.
+    """
+    simulator = Simulator(recipe, fresh=fresh)
+    try:
+        for number, own in enumerate(actions.tolist()):
+            played = _episode(simulator, number, own)
+            for t, (outcome, expected) in enumerate(zip(played, trace, strict=False)):
+                if _digest(outcome) != expected[number]:
+                    return (
+                        f"{f'step {t}' if t else 'the reset'} of episode {number + 1}"
+                    )
     finally:
         simulator.close()
-    facts = {"n_actions": int(actions.n), "first_action": int(actions.start)}
-    return facts | {"state_dim": len(seen)}
+    return ""
 
 
-def _no_vector(task: Gymnasium, space: spaces.Space) -> str:
-    """Why observations can't be learned from, and what makes a vector of them."""
-    why = f"has observations {space}, which are no vector of a fixed length; "
-    if task.id.startswith("minigrid:"):
-        why += "env.wrappers=[{name: minigrid.wrappers.ImgObsWrapper}], or "
-    if isinstance(space, spaces.Dict):
-        keys = [key for key, part in space.spaces.items() if plain_parts(part)]
-        if keys:
-            listed = f"filter_keys: [{', '.join(map(str, keys))}]"
-            why += f"env.wrappers=[{{name: FilterObservation, {listed}}}], or "
-    return f"{why}env.observation=module.function makes an array of them"
-
-
-def _made(fields: dict[str, Any], fresh: bool) -> Gymnasium:
-    task = Gymnasium(**fields)
-    if fresh:
-        FRESH.add(_measured(task))
-    return task
+def _checked_actions(simulator: Simulator) -> int:
+    """The number of actions; BcrlError for spaces that can't be learned in."""
+    recipe, space, actions = simulator.recipe, simulator.space, simulator.actions
+    if not isinstance(actions, spaces.Discrete):
+        why = f"has actions {actions}, only Discrete ones can be learned; "
+        box = isinstance(actions, spaces.Box)
+        hint = "env.wrappers=[{name: DiscretizeAction, bins: 5}]" if box else ""
+        raise ConfigError(
+            "env.id", recipe.id, why + (hint or "a wrapper can number them")
+        )
+    if not 1 <= actions.n <= _MOST_ACTIONS:
+        why = f"has {actions.n} actions, from 1 to {_MOST_ACTIONS} can be learned"
+        raise ConfigError("env.id", recipe.id, why)
+    if not isinstance(space, spaces.Space):
+        problem = f"is {space!r} of type {type(space).__name__}"
+        raise simulator.broken("observation_space", problem, "a space of gymnasium's")
+    if recipe.observation is None and not is_plain(space):
+        why = f"has observations {space}, which are no vector of a fixed length; "
+        if recipe.id.startswith("minigrid:"):
+            why += "env.wrappers=[{name: minigrid.wrappers.ImgObsWrapper}], or "
+        if isinstance(space, spaces.Dict):
+            keys = ", ".join(str(k) for k, v in space.spaces.items() if is_plain(v))
+            wrapper = f"{{name: FilterObservation, filter_keys: [{keys}]}}"
+            why += f"env.wrappers=[{wrapper}], or "
+        why += "env.observation=module.function makes an array of them"
+        raise ConfigError("env.id", recipe.id, why)
+    return int(actions.n)
 
 
 ENV = Gymnasium

@@ -6,16 +6,21 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
+import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from bcrl.common.arrays import like, namespace, ndtri
-from bcrl.envs import _point_mass as point_mass
-from bcrl.envs._point_mass import ACTION_COST, DT, GOAL_RADIUS, PATHWAY, START
-from bcrl.envs.base import Step, check_episodes
+from bcrl.common.arrays import ndtri, per_lane
+from bcrl.envs.base import Floats, Ints, Step, check_episodes
 from bcrl.errors import ConfigError, did_you_mean
 
+DT = 0.05  # s, Euler step
+NOISE = 1e-5  # standard deviation of the noise on each component of the derivative
 WALLS = (-5.0, 1.0)  # x of the two reflecting walls (target task)
+PATHWAY = 0.5  # |y| beyond which the target task starts anew
+_GOAL_RADIUS = 0.2  # distance to the origin that counts as success
+_START = np.array([-4.0, 0.0, 0.0, 0.0])
+STATE_COST = (3.0, 1.0, 3.0, 1.0)  # diagonal, LQ task
+ACTION_COST = 0.1  # per squared unit of force, LQ task
 DIAGONAL = np.sqrt(0.5)
 ACTIONS = np.array(
     [[1, 0], [0, 1], [-1, 0], [0, -1]]
@@ -24,7 +29,7 @@ ACTIONS = np.array(
 
 
 class Constants(NamedTuple):
-    """What the readings differ in: dynamics, and the half-width of the start's box."""
+    """Constants that the presets set: dynamics, and half-widths of the start's box."""
 
     gain: float
     friction: float
@@ -32,7 +37,7 @@ class Constants(NamedTuple):
 
 
 #: preset → task → constants (paper, C.3; released code)
-PRESETS = {
+_PRESETS = {
     "released": {
         "lq": Constants(2.0, 0.1, (0.3, 0.3, 0.3, 0.3)),
         "target": Constants(2.0, 1.0, (1e-3, 0.1, 0.4, 0.1)),
@@ -50,18 +55,17 @@ class LinearSystem:
 
     | | |
     |---|---|
-    | observation | (x, ẋ, y, ẏ), dimensionless |
+    | observation | (x, ẋ, y, ẏ), dimensionless; unbounded, but see `bounds` |
     | actions | unit forces: 0–3 +x, +y, −x, −y; 4–7 (+,+), (+,−), (−,+), (−,−) |
     | dynamics | x' = ẋ, ẋ' = −friction ẋ + gain F_x, same for y; noise N(0, 1e-5²) on each derivative; Euler steps of 0.05 s |
     | `task=lq` | reward −s'ᵀ diag(3, 1, 3, 1) s' − 0.1 ‖F‖²; horizon 100; never absorbing |
-    | `task=target` | `drift` is added to x'; walls at x = −5 and x = 1 reflect; (the drift may leave x outside by 0.02, where ẋ changes sign each step); whoever ends a step with \\|y\\| > 0.5 is put back to a fresh start (not absorbing); reward 0 and absorbing if ‖(x, y)‖ < 0.2, else −1; horizon 150 |
-    | start | (−4, 0, 0, 0) plus a uniform draw from a box, see PRESETS |
+    | `task=target` | `drift` is added to x'; walls at x = −5 and x = 1 reflect (the drift may push x beyond by 0.02, where ẋ changes sign each step); a step that ends with \\|y\\| > 0.5 leads to a fresh start (not absorbing); reward 0 and absorbing if ‖(x, y)‖ < 0.2, else −1; horizon 150 |
+    | start | (−4, 0, 0, 0) plus a uniform draw from a box, see `constants` |
     | source | Klink et al. (2022), §6.3 and C.3; released code for dt, walls, γ, horizons |
 
     `preset=released` (default) has gain 2, friction 0.1 in the LQ task and 1.0 in the
-    target, `paper` gain 1 and friction 0.1 in both, and smaller start boxes. Runs on
-    NumPy arrays and on torch tensors alike. Raises ConfigError for an unknown task or
-    preset, γ outside [0, 1) or a horizon below 1.
+    target, `paper` gain 1 and friction 0.1 in both, and smaller start boxes. Raises
+    ConfigError for an unknown task or preset, γ outside [0, 1) or a horizon below 1.
     """  # noqa: E501
 
     task: str = "target"
@@ -75,11 +79,11 @@ class LinearSystem:
     state_dim: ClassVar[int] = 4
     initial_noise: ClassVar[int] = 4
     step_noise: ClassVar[int] = 8  # four for the derivative, four for a fresh start
-    actions: ClassVar[NDArray[np.float64]] = ACTIONS
+    actions: ClassVar[Floats] = ACTIONS
     positions: ClassVar[tuple[int, ...]] = (0, 2)
 
     def __post_init__(self) -> None:
-        for key, allowed in (("task", ("lq", "target")), ("preset", tuple(PRESETS))):
+        for key, allowed in (("task", ("lq", "target")), ("preset", tuple(_PRESETS))):
             value = getattr(self, key)
             if value not in allowed:
                 raise ConfigError(f"env.{key}", value, did_you_mean(value, allowed))
@@ -88,17 +92,17 @@ class LinearSystem:
     @property
     def constants(self) -> Constants:
         """Gain, friction and start box of this task in this preset."""
-        return PRESETS[self.preset][self.task]
+        return _PRESETS[self.preset][self.task]
 
     @property
-    def bounds(self) -> NDArray[np.float64]:
+    def bounds(self) -> Floats:
         """The lowest and the highest components of a state, (2, 4); some are infinite.
 
-        Friction holds the velocities below what a unit force and noise of at most ten
-        standard deviations keep up; the drift may lead beyond the walls by one step.
+        Friction holds the velocities below the one that a unit force and noise of ten
+        standard deviations sustain; the drift may lead beyond the walls by one step.
         """
         gain, friction, spread = self.constants
-        noise = 10.0 * point_mass.NOISE
+        noise = 10.0 * NOISE
         fast = [max(spread[i], (gain + noise) / friction) for i in (1, 3)]
         if self.task == "lq":
             high = np.array([np.inf, fast[0], np.inf, fast[1]])
@@ -108,122 +112,139 @@ class LinearSystem:
         return np.array([low, [WALLS[1] + beyond, fast[0], PATHWAY, fast[1]]])
 
     @property
-    def linear_quadratic(self) -> tuple[NDArray[np.float64], ...] | None:
+    def linear_quadratic(self) -> tuple[Floats, ...] | None:
         """A, B, Q, R of s' = A s + B F, reward −s'ᵀ Q s' − Fᵀ R F; None if not so."""
         if self.task != "lq":
             return None
         gain, friction, _ = self.constants
         drift = np.kron(np.eye(2), np.array([[0.0, 1.0], [0.0, -friction]]))
         push = np.kron(np.eye(2), np.array([[0.0], [gain]]))
-        return (
-            np.eye(4) + DT * drift,
-            DT * push,
-            np.diag(point_mass.STATE_COST),
-            ACTION_COST * np.eye(2),
-        )
+        a, b = np.eye(4) + DT * drift, DT * push
+        return a, b, np.diag(STATE_COST), ACTION_COST * np.eye(2)
 
     @cached_property
-    def _dynamics(self) -> point_mass.Dynamics:
-        gain, friction, _ = self.constants
-        if self.task == "lq":
-            return point_mass.Dynamics(gain, friction, 0.0, -np.inf, np.inf)
-        return point_mass.Dynamics(gain, friction, self.drift, *WALLS)
+    def _dynamics(self) -> Floats:
+        """Gain, friction, drift, the walls' x and the start box, for compiled code."""
+        gain, friction, spread = self.constants
+        free = self.task == "lq"
+        rest = (0.0, -np.inf, np.inf) if free else (self.drift, *WALLS)
+        return np.array([gain, friction, *rest, *spread])
 
-    @cached_property
-    def _for_lanes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Start box and dynamics as arrays."""
-        return np.array(self.constants.spread), np.array(self._dynamics)
-
-    def initial(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    def initial(self, noise: Floats) -> Floats:
         """Start states (..., 4): the box around (−4, 0, 0, 0), for noise (..., 4)."""
-        found = point_mass.start(_components(noise), self.constants.spread)
-        return namespace(noise).stack(found, -1)
+        return _START + np.array(self.constants.spread) * (2.0 * noise - 1.0)
 
-    def step(
-        self,
-        state: NDArray[np.float64],
-        action: NDArray[np.integer],
-        noise: NDArray[np.float64],
-    ) -> Step:
+    def step(self, state: Floats, action: Ints, noise: Floats) -> Step:
         """One step with action (...), an index into `actions`."""
-        return self.push(state, like(ACTIONS, state)[action], noise)
+        return self.push(state, ACTIONS[action], noise)
 
-    def push(
-        self,
-        state: NDArray[np.float64],
-        force: NDArray[np.float64],
-        noise: NDArray[np.float64],
-    ) -> Step:
+    def push(self, state: Floats, force: Floats, noise: Floats) -> Step:
         """One step with any force (..., 2); the fresh start, if any, is in `noise`."""
-        xp = namespace(state)
-        normal, uniform = ndtri(noise[..., :4]), noise[..., 4:]
-        if xp is np:
-            spread, dynamics = self._for_lanes
-            if self.task == "target":
-                return point_mass.pathway_lanes(
-                    state, force, normal, uniform, spread, dynamics
-                )
-            after, reward = point_mass.lq_lanes(state, force, normal, dynamics)
-            return after, reward, np.zeros_like(reward, bool)
-        moved = self._moved(state, force, normal)
-        if self.task == "lq":
-            reward = point_mass.lq_reward(moved, _components(force))
-            return xp.stack(moved, -1), reward, xp.zeros_like(reward, dtype=bool)
-        fresh = point_mass.start(_components(uniform), self.constants.spread)
-        after, reward, arrived = point_mass.pathway(xp.where, moved, fresh)
-        return xp.stack(after, -1), reward, arrived
+        normal = ndtri(noise[..., :4])
+        if self.task == "target":
+            return _pathway(state, force, normal, noise[..., 4:], self._dynamics)
+        after, reward = _lq(state, force, normal, self._dynamics)
+        return after, reward, np.zeros_like(reward, bool)
 
-    def before_reset(
-        self,
-        state: NDArray[np.float64],
-        action: NDArray[np.integer],
-        noise: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
+    def before_reset(self, state: Floats, action: Ints, noise: Floats) -> Floats:
         """Where `step` leads before a fresh start replaces it, (..., 4)."""
-        force, normal = like(ACTIONS, state)[action], ndtri(noise[..., :4])
-        if namespace(state) is np:
-            return point_mass.motion_lanes(state, force, normal, self._for_lanes[1])
-        return namespace(state).stack(self._moved(state, force, normal), -1)
+        return _move(state, ACTIONS[action], ndtri(noise[..., :4]), self._dynamics)
 
-    def _moved(self, state: Any, force: Any, normal: Any) -> tuple[Any, ...]:
-        """`point_mass.motion` on whole tensors."""
-        parts = map(_components, (state, force, normal))
-        return point_mass.motion(namespace(state).where, *parts, self._dynamics)
-
-    def evaluation_states(self) -> NDArray[np.float64]:
+    def evaluation_states(self) -> Floats:
         """(−4, 0, 0, 0) and the corners of half the target's start box, (17, 4).
 
-        The same in both tasks, so that FQI's curves go on from one to the other.
+        The same in both tasks, so that FQI's curves are comparable between them.
         """
-        half = 0.5 * np.array(PRESETS[self.preset]["target"].spread)
+        half = 0.5 * np.array(_PRESETS[self.preset]["target"].spread)
         signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 4, indexing="ij"), -1)
-        return np.array(START) + half * np.vstack(
-            [np.zeros((1, 4)), signs.reshape(-1, 4)]
-        )
+        return _START + half * np.vstack([np.zeros((1, 4)), signs.reshape(-1, 4)])
 
-    def plane(self, side: int = 41, extent: float = 5.0) -> NDArray[np.float64]:
+    def plane(self, side: int = 41, extent: float = 5.0) -> Floats:
         """The x–y plane [−extent, extent]² at zero velocity, x-major, (side², 4)."""
         axis = np.linspace(-extent, extent, side)
         states = np.zeros((side, side, 4))
         states[..., 0], states[..., 2] = np.meshgrid(axis, axis, indexing="ij")
         return states.reshape(-1, 4)
 
-    def scene(self) -> dict[str, NDArray[np.float64]]:
+    def scene(self) -> dict[str, Floats]:
         """What a figure needs to draw the task: forces, pathway, goal, start, drift."""
-        half = np.array(self.constants.spread)[[0, 2]]
-        at = np.array(START)[[0, 2]]
+        at, half = _START[[0, 2]], np.array(self.constants.spread)[[0, 2]]
         return {
             "actions": ACTIONS,
             "pathway": np.array([WALLS[0], -PATHWAY, WALLS[1], PATHWAY]),
-            "goal": np.array([0.0, 0.0, GOAL_RADIUS]),
+            "goal": np.array([0.0, 0.0, _GOAL_RADIUS]),
             "start": np.concatenate([at - half, at + half]),
             "drift": np.array([self.drift, 0.0]),
         }
 
 
-def _components(array: Any) -> tuple[Any, ...]:
-    """The entries of the last axis, each an array of the leading axes."""
-    return tuple(array[..., i] for i in range(array.shape[-1]))
+@numba.njit
+def _moved(state: Any, force: Any, normal: Any, dynamics: Any) -> Any:
+    """The components (x, ẋ, y, ẏ) after one step: integrated, then reflected."""
+    x, x_dot, y, y_dot = state[0], state[1], state[2], state[3]
+    gain, friction, drift = dynamics[0], dynamics[1], dynamics[2]
+    low, high = dynamics[3], dynamics[4]
+    new_x = x + DT * (x_dot + drift + NOISE * normal[0])
+    new_x_dot = x_dot + DT * (gain * force[0] - friction * x_dot + NOISE * normal[1])
+    new_y = y + DT * (y_dot + NOISE * normal[2])
+    new_y_dot = y_dot + DT * (gain * force[1] - friction * y_dot + NOISE * normal[3])
+    if not (new_x < low or new_x > high):
+        return new_x, new_x_dot, new_y, new_y_dot
+    # A straight line to the contact, then without force and drift. Where the drift
+    # overcame the velocity, mirroring leads outside by a little: share 0.
+    span = 1.0 if new_x == x else new_x - x
+    share = ((low if new_x < low else high) - x) / span
+    share = 0.0 if share < 0.0 else 1.0 if share > 1.0 else share
+    rest = (1.0 - share) * DT
+    x_dot_there = -(x_dot + share * (new_x_dot - x_dot))
+    y_dot_there = y_dot + share * (new_y_dot - y_dot)
+    return (
+        x + share * (new_x - x) + rest * x_dot_there,
+        x_dot_there - rest * friction * x_dot_there,
+        y + share * (new_y - y) + rest * y_dot_there,
+        y_dot_there - rest * friction * y_dot_there,
+    )
+
+
+@per_lane("(f8[:], f8[:], f8[:], f8[:], f8[:])", "(s),(k),(s),(c)->(s)")
+def _move(state: Any, force: Any, normal: Any, dynamics: Any, after: Any) -> None:
+    after[0], after[1], after[2], after[3] = _moved(state, force, normal, dynamics)
+
+
+@per_lane("(f8[:], f8[:], f8[:], f8[:], f8[:], f8[:])", "(s),(k),(s),(c)->(s),()")
+def _lq(
+    state: Any, force: Any, normal: Any, dynamics: Any, after: Any, reward: Any
+) -> None:
+    """The LQ task's next state and reward."""
+    after[0], after[1], after[2], after[3] = _moved(state, force, normal, dynamics)
+    cost = ACTION_COST * (force[0] * force[0] + force[1] * force[1])
+    for i in range(4):
+        cost = cost + STATE_COST[i] * after[i] * after[i]
+    reward[0] = -cost
+
+
+@per_lane(
+    "(f8[:], f8[:], f8[:], f8[:], f8[:], f8[:], f8[:], b1[:])",
+    "(s),(k),(s),(s),(c)->(s),(),()",
+)
+def _pathway(
+    state: Any,
+    force: Any,
+    normal: Any,
+    uniform: Any,
+    dynamics: Any,
+    after: Any,
+    reward: Any,
+    arrived: Any,
+) -> None:
+    """The target task's next state, reward and end; `uniform` gives a fresh start."""
+    after[0], after[1], after[2], after[3] = _moved(state, force, normal, dynamics)
+    if after[2] > PATHWAY or after[2] < -PATHWAY:
+        for i in range(4):  # as `initial`
+            after[i] = _START[i] + dynamics[5 + i] * (2.0 * uniform[i] - 1.0)
+    distance = after[0] * after[0] + after[2] * after[2]
+    arrived[0] = distance < _GOAL_RADIUS * _GOAL_RADIUS
+    reward[0] = 0.0 if arrived[0] else -1.0
 
 
 ENV = LinearSystem

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.envs.base import Step, check_episodes
+from bcrl.envs.base import Bools, Floats, Ints, Step, check_episodes
 from bcrl.errors import ConfigError, did_you_mean
 
 SIDE = 21  # lattice points along each axis
@@ -45,11 +45,11 @@ class Maze:
 
     `height` is the task parameter h. `preset` names three readings of the constants:
     `lattice` (default) compares exact lattice positions, w = 0.05; `paper` takes the
-    text literally, goal distance < 0.1 and w = 0.025; `released` adds the moves up in
+    text literally, goal distance < 0.1 and w = 0.025; `released` adds up the moves in
     floating point with w = 0.05 and goal distance < 0.1, as the authors' code does, so
-    that what lies on a boundary depends on the path taken there.
-    Raises ConfigError for a height outside [0, 1), an unknown preset, γ outside [0, 1)
-    or a horizon below 1.
+    on a boundary the path decides which side a position is on. Raises
+    ConfigError for a height outside [0, 1), an unknown preset, γ outside [0, 1) or a
+    horizon below 1.
     """
 
     height: float = 0.95
@@ -62,7 +62,7 @@ class Maze:
     state_dim: ClassVar[int] = 2
     initial_noise: ClassVar[int] = 0
     step_noise: ClassVar[int] = 0
-    actions: ClassVar[NDArray[np.float64]] = MOVES
+    actions: ClassVar[Floats] = MOVES
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.height < 1.0:
@@ -78,23 +78,23 @@ class Maze:
         return PRESETS[self.preset][2]
 
     @property
-    def walls(self) -> NDArray[np.float64]:
+    def walls(self) -> Floats:
         """Both walls as rectangles (x0, y0, x1, y1), shape (2, 4)."""
         w = PRESETS[self.preset][0]
         (a, b), h = WALL_X, self.height
         return np.array([[a - w, 0.0, a + w, h], [b - w, 1.0 - h, b + w, 1.0]])
 
     @property
-    def bounds(self) -> NDArray[np.float64]:
+    def bounds(self) -> Floats:
         """The lowest and the highest coordinates, (2, 2)."""
         return np.array([[0.0, 0.0], [1.0, 1.0]])
 
     @property
-    def goal(self) -> NDArray[np.float64]:
+    def goal(self) -> Floats:
         """Centre of the goal, shape (2,)."""
         return GOAL
 
-    def blocked(self, state: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def blocked(self, state: Floats) -> Bools:
         """Whether states (..., 2) lie strictly inside a wall, shape (...)."""
         half_width, _, on_lattice = PRESETS[self.preset]
         slack = ROUNDING if on_lattice else 0.0
@@ -103,7 +103,7 @@ class Maze:
         second = abs(x - WALL_X[1]) < half_width - slack
         return first | (second & (y > 1.0 - self.height + slack))
 
-    def is_goal(self, state: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def is_goal(self, state: Floats) -> Bools:
         """Whether states (..., 2) lie at the goal, shape (...)."""
         _, inclusive, on_lattice = PRESETS[self.preset]
         distance = abs(state - GOAL).sum(-1)
@@ -111,16 +111,11 @@ class Maze:
             return distance < GOAL_RADIUS
         return distance < GOAL_RADIUS + (ROUNDING if inclusive else -ROUNDING)
 
-    def initial(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    def initial(self, noise: Floats) -> Floats:
         """The corner (0, 0) for noise of shape (..., 0)."""
         return np.zeros((*noise.shape[:-1], 2))
 
-    def step(
-        self,
-        state: NDArray[np.float64],
-        action: NDArray[np.integer],
-        noise: NDArray[np.float64] | None = None,
-    ) -> Step:
+    def step(self, state: Floats, action: Ints, noise: Floats | None = None) -> Step:
         """One move; see the class docstring."""
         moved = np.clip(state + MOVES[action], 0.0, 1.0)
         if self.finite:
@@ -130,16 +125,16 @@ class Maze:
         reward = np.where(at_goal, GOAL_REWARD, -abs(moved - GOAL).sum(-1))
         return moved, reward, at_goal
 
-    def evaluation_states(self) -> NDArray[np.float64]:
+    def evaluation_states(self) -> Floats:
         """The start state, shape (1, 2)."""
         return np.zeros((1, 2))
 
-    def states(self) -> NDArray[np.float64]:
+    def states(self) -> Floats:
         """The lattice, x-major, shape (441, 2)."""
         axis = np.arange(SIDE) / (SIDE - 1)
         return np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
 
-    def index(self, state: NDArray[np.float64]) -> NDArray[np.intp]:
+    def index(self, state: Floats) -> NDArray[np.intp]:
         """Row of the nearest lattice point of each state (..., 2)."""
         cell = np.rint(np.asarray(state) * (SIDE - 1)).astype(np.intp)
         return cell[..., 0] * SIDE + cell[..., 1]

@@ -1,10 +1,9 @@
-"""Environments as pictures: one function each, and bars for those that have none."""
+"""Environments as pictures: one function each, and bars for other environments."""
 
 from __future__ import annotations
 
 import itertools
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,72 +11,67 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from bcrl.envs import Env
+from bcrl.envs.base import Floats
 from bcrl.envs.maze import GOAL_RADIUS
 
-SIZE = 400  # pixels of a picture's sides
-FINER = 2  # times as many pixels are drawn, then averaged: smooth edges
+_SIZE = 400  # pixels of a picture's sides
+FINER = 2  # the drawing has so many times the pixels, for smooth edges
 FONT = ImageFont.load_default(15)
 
-#: Okabe and Ito's colours, which colour-blind people tell apart, and greys.
+#: Okabe and Ito's colours, which colour-blind people can distinguish, and greys.
 BLUE, ORANGE, GREEN = "#0072B2", "#E69F00", "#009E73"
 VERMILION, SKY = "#D55E00", "#56B4E9"
 PAPER, PALE, GREY, INK = "#FBFBF9", "#E4E4DF", "#8A8A85", "#2B2B2B"
 
-Points = Sequence[Sequence[float]] | NDArray[np.float64]
-
 
 class Canvas:
-    """A square picture of the square view [left, left + side] × [bottom, …].
+    """A square picture of [left, left + side] × [bottom, bottom + side].
 
-    Points and lengths are the view's, y upwards; widths of lines are pixels.
+    Points (n, 2) and lengths have the units of this view, y upwards; widths of lines
+    are pixels.
     """
 
     def __init__(self, left: float, bottom: float, side: float, ground: str) -> None:
-        self.left, self.bottom, self.scale = left, bottom, SIZE * FINER / side
-        self._image = Image.new("RGB", (SIZE * FINER, SIZE * FINER), ground)
+        self.corner, self.scale = np.array([left, bottom]), _SIZE * FINER / side
+        self._image = Image.new("RGB", (_SIZE * FINER, _SIZE * FINER), ground)
         self._pen = ImageDraw.Draw(self._image)
         self._texts: list[tuple[tuple[int, int], str, str]] = []
 
-    def _pixels(self, points: Points) -> list[tuple[float, float]]:
-        x, y = np.asarray(points, float).T
-        across, up = (x - self.left) * self.scale, (y - self.bottom) * self.scale
-        return list(zip(across, SIZE * FINER - up, strict=True))
+    def _pixels(self, points: Any) -> list[tuple[float, float]]:
+        x, y = ((np.asarray(points, float) - self.corner) * self.scale).T
+        return list(zip(x, _SIZE * FINER - y, strict=True))
 
-    def polygon(self, points: Points, fill: str) -> None:
+    def polygon(self, points: Any, fill: str) -> None:
         self._pen.polygon(self._pixels(points), fill)
 
     def rectangle(self, x0: float, y0: float, x1: float, y1: float, fill: str) -> None:
         self.polygon([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], fill)
 
-    def line(self, points: Points, fill: str, width: float) -> None:
+    def line(self, points: Any, fill: str, width: float) -> None:
         whole = round(width * FINER)
         self._pen.line(self._pixels(points), fill, whole, joint="curve")
 
-    def disc(
-        self, at: Sequence[float], radius: float, fill: str, edge: str | None = None
-    ) -> None:
+    def disc(self, at: Any, radius: float, fill: str, edge: str | None = None) -> None:
         ((x, y),) = self._pixels([at])
         self._pen.circle((x, y), radius * self.scale, fill, edge, 2 * FINER)
 
-    def arrow(self, at: Points, vector: Points, fill: str, width: float = 3) -> None:
+    def arrow(self, at: Any, vector: Any, fill: str, width: float = 3) -> None:
         """From `at` along `vector`; nothing if that is shorter than its head."""
-        at, vector = np.asarray(at, float), np.asarray(vector, float)
         length, head = np.linalg.norm(vector), 4 * width * FINER / self.scale
-        if length < head:
-            return
-        along = vector / length
-        across = np.array([-along[1], along[0]])
-        neck = at + vector - head * along
-        self.line([at, neck], fill, width)
-        wings = neck + head * 0.5 * across, neck - head * 0.5 * across
-        self.polygon([at + vector, *wings], fill)
+        if length >= head:
+            along = np.asarray(vector) / length
+            across = 0.5 * head * np.array([-along[1], along[0]])
+            tip = np.asarray(at) + vector
+            neck = tip - head * along
+            self.line([at, neck], fill, width)
+            self.polygon([tip, neck + across, neck - across], fill)
 
     def text(self, x: int, y: int, words: str, anchor: str = "la") -> None:
         """Words at a pixel of the picture, from its upper left corner."""
         self._texts.append(((x, y), words, anchor))
 
     def picture(self) -> NDArray[np.uint8]:
-        """What was drawn, (SIZE, SIZE, 3)."""
+        """The drawing, (400, 400, 3)."""
         image = self._image.reduce(FINER)
         pen = ImageDraw.Draw(image)
         for at, words, anchor in self._texts:
@@ -86,89 +80,75 @@ class Canvas:
 
 
 def draw(
-    env: Env, path: NDArray[np.float64], action: Any = None, caption: str = ""
+    env: Env, path: Floats, action: Any = None, caption: str = ""
 ) -> NDArray[np.uint8]:
-    """A picture (SIZE, SIZE, 3) of an env after the states `path` (n, d).
+    """A picture (400, 400, 3) of an environment after the states `path` (n, d).
 
-    The last state is the present one; `action`, a number or a force (k,), is what
-    is done in it. `caption` stands below the picture.
+    The last state is the present one; `action`, a number or a force (k,), is applied
+    in it. `caption` stands below the picture.
     """
     vectors = getattr(env, "actions", None)
-    known = action is not None and np.ndim(action) == 0 and vectors is not None
-    force = vectors[action] if known else action
-    canvas = _drawing(env)[0](env, np.asarray(path, float), force)
-    canvas.text(12, SIZE - 10, caption, "ld")
+    if action is not None and np.ndim(action) == 0 and vectors is not None:
+        action = vectors[action]
+    drawing = DRAWINGS.get(type(env).__module__, _bars)
+    canvas = drawing(env, np.asarray(path, float), action)
+    canvas.text(12, _SIZE - 10, caption, "ld")
     return canvas.picture()
 
 
 def frames_per_second(env: Env) -> int:
-    """How many steps a second a moving picture should show."""
-    return _drawing(env)[1]
+    """The number of steps that an animation shows per second."""
+    return 20 if type(env).__module__ == "bcrl.envs.linear_system" else 10
 
 
-def _drawing(env: Env) -> tuple[Callable[..., Canvas], int]:
-    return DRAWINGS.get(type(env).__module__, (_bars, 10))
-
-
-def hill(p: float | NDArray[np.float64]) -> Any:
-    """The hill's height at p, the integral of the slope that the car feels."""
+def _height(p: Any) -> Any:
+    """The hill's height at p, the integral of its slope."""
     return np.where(p < 0.0, p * p + p, p / np.sqrt(1.0 + 5.0 * p * p))
 
 
-def _car_on_hill(env: Any, path: NDArray, force: Any) -> Canvas:
+def _car_on_hill(env: Any, path: Floats, force: Any) -> Canvas:
     """The car on its hill: the goal's flag on the right, the drop on the left."""
     canvas = Canvas(-1.3, -0.95, 2.6, PAPER)
     p = np.linspace(-1.3, 1.3, 131)
-    profile = np.stack([p, hill(p)], -1)
+    profile = np.stack([p, _height(p)], -1)
     canvas.polygon([(-1.3, -0.95), *profile, (1.3, -0.95)], PALE)
     canvas.line(profile, GREY, 3)
-    top = float(hill(1.0))
+    top = float(_height(1.0))
     canvas.line([(1.0, top), (1.0, top + 0.34)], INK, 3)
-    flag = [(1.0, top + 0.34), (1.0, top + 0.2), (1.19, top + 0.27)]
-    canvas.polygon(flag, GREEN)
-    for y in np.arange(0.0, 0.6, 0.1):  # whoever crosses this is lost
+    canvas.polygon([(1.0, top + 0.34), (1.0, top + 0.2), (1.19, top + 0.27)], GREEN)
+    for y in np.arange(0.0, 0.6, 0.1):  # a car that crosses this line is lost
         canvas.line([(-1.0, y), (-1.0, y + 0.05)], VERMILION, 2)
-    at, speed = path[-1]
-    p0 = min(max(at, -1.25), 1.25)
-    along = np.array([2e-3, float(hill(p0 + 1e-3) - hill(p0 - 1e-3))])
+    position, speed = path[-1]
+    at = min(max(position, -1.25), 1.25)
+    along = np.array([2e-3, _height(at + 1e-3) - _height(at - 1e-3)])
     along /= np.linalg.norm(along)
-    up = np.array([-along[1], along[0]])
-    foot = np.array([p0, float(hill(p0))])
-
-    def body(*corners: tuple[float, float]) -> NDArray:
-        return foot + np.array([a * along + b * up for a, b in corners])
-
-    canvas.polygon(body((-0.13, 0.05), (0.13, 0.05), (0.13, 0.1), (-0.13, 0.1)), BLUE)
-    cabin = body((-0.08, 0.1), (0.06, 0.1), (0.03, 0.16), (-0.06, 0.16))
-    canvas.polygon(cabin, SKY)
-    for wheel in body((-0.075, 0.04), (0.075, 0.04)):
+    axes = np.array([along, [-along[1], along[0]]])
+    foot = np.array([at, float(_height(at))])
+    body = np.array([(-0.13, 0.05), (0.13, 0.05), (0.13, 0.1), (-0.13, 0.1)])
+    cabin = np.array([(-0.08, 0.1), (0.06, 0.1), (0.03, 0.16), (-0.06, 0.16)])
+    wheels = np.array([(-0.075, 0.04), (0.075, 0.04)])
+    canvas.polygon(foot + body @ axes, BLUE)
+    canvas.polygon(foot + cabin @ axes, SKY)
+    for wheel in foot + wheels @ axes:
         canvas.disc(wheel, 0.04, INK)
     if force is not None:
-        side = math.copysign(1.0, force[0])
-        start = foot + 0.09 * up + 0.15 * side * along
+        side = np.sign(force[0])
+        start = foot + np.array([0.15 * side, 0.09]) @ axes
         canvas.arrow(start, 0.25 * side * along, ORANGE, 4)
-    _gauge(canvas, speed, 3.0)
+    end = 0.8 * min(max(speed / 3.0, -1.0), 1.0)  # a gauge of the speed
+    canvas.rectangle(-0.8, -0.645, 0.8, -0.595, PAPER)
+    canvas.rectangle(min(0, end), -0.645, max(0, end), -0.595, BLUE)
+    canvas.text(_SIZE // 2, 312, f"{speed:+.2f} m/s", "mm")
     canvas.text(12, 10, f"Car on the hill, {env.mass:g} kg")
     return canvas
 
 
-def _gauge(canvas: Canvas, value: float, limit: float) -> None:
-    """A bar for the speed, on a scale from −limit to limit, which is not to be left."""
-    y, half, lost = -0.62, 0.8, abs(value) > limit
-    end = half * min(max(value / limit, -1.0), 1.0)
-    canvas.rectangle(-half, y - 0.025, half, y + 0.025, PAPER)
-    canvas.rectangle(min(0, end), y - 0.025, max(0, end), y + 0.025, BLUE)
-    for x, colour in ((-half, VERMILION), (0.0, GREY), (half, VERMILION)):
-        canvas.line([(x, y - 0.05), (x, y + 0.05)], colour, 3 if lost else 2)
-    canvas.text(SIZE // 2, 312, f"{value:+.2f} m/s", "mm")
-
-
-def _maze(env: Any, path: NDArray, force: Any) -> Canvas:
-    """The two walls, the goal, the way walked so far."""
+def _maze(env: Any, path: Floats, force: Any) -> Canvas:
+    """The two walls, the goal, the way so far."""
     canvas = Canvas(-0.13, -0.13, 1.26, PALE)
-    low, high = -0.025, 1.025  # half a lattice cell beyond what can be reached
+    low, high = -0.025, 1.025  # half a lattice cell beyond the outermost positions
     canvas.rectangle(low, low, high, high, PAPER)
-    (x, y), r = env.goal, GOAL_RADIUS  # a diamond; what lies beyond is covered
+    (x, y), r = env.goal, GOAL_RADIUS  # a diamond, whose outer corners are covered
     canvas.polygon([(x - r, y), (x, y - r), (x + r, y), (x, y + r)], GREEN)
     canvas.rectangle(high, low, 1.1, 1.1, PALE)
     canvas.rectangle(low, high, 1.1, 1.1, PALE)
@@ -176,16 +156,15 @@ def _maze(env: Any, path: NDArray, force: Any) -> Canvas:
         below, above = (low if y0 == 0 else y0), (high if y1 == 1 else y1)
         canvas.rectangle(x0, below, x1, above, GREY)
     canvas.disc(path[0], 0.016, PAPER, INK)
-    if len(path) > 1:
-        canvas.line(path, SKY, 3)
+    canvas.line(path, SKY, 3)
     canvas.disc(path[-1], 0.024, BLUE)
     if force is not None:
-        canvas.arrow(path[-1], 1.6 * np.asarray(force), ORANGE, 3)
+        canvas.arrow(path[-1], 1.6 * np.asarray(force), ORANGE)
     canvas.text(12, 8, f"Maze, walls of height {env.height:g}")
     return canvas
 
 
-def _linear_system(env: Any, path: NDArray, force: Any) -> Canvas:
+def _linear_system(env: Any, path: Floats, force: Any) -> Canvas:
     """The x–y plane: pathway and goal, the mass with its velocity and the force."""
     left, bottom, side = -5.4, -3.4, 6.8
     scene, narrow = env.scene(), env.task == "target"
@@ -195,7 +174,7 @@ def _linear_system(env: Any, path: NDArray, force: Any) -> Canvas:
         canvas.rectangle(x0, y0, x1, y1, PAPER)
         for x in (x0, x1):
             canvas.line([(x, y0), (x, y1)], INK, 4)
-        canvas.arrow((-1.5, -0.95), 1.6 * scene["drift"], GREY, 3)
+        canvas.arrow((-1.5, -0.95), 1.6 * scene["drift"], GREY)
         canvas.text(250, 246, "drift")
     canvas.line([(left, 0), (left + side, 0)], PALE, 1)
     canvas.disc(scene["goal"][:2], float(scene["goal"][2]), GREEN)
@@ -205,12 +184,8 @@ def _linear_system(env: Any, path: NDArray, force: Any) -> Canvas:
     for a, b in itertools.pairwise(places):
         if np.abs(b - a).max() < 0.4:  # more is a fresh start, not a motion
             canvas.line([a, b], SKY, 2.5)
-    border = 0.12
-    at = np.clip(
-        places[-1],
-        (left + border, bottom + border),
-        (left + side - border, bottom + side - border),
-    )
+    low = np.array([left, bottom]) + 0.12
+    at = np.clip(places[-1], low, low + side - 0.24)
     canvas.disc(at, 0.09, BLUE)
     canvas.arrow(at, 0.8 * path[-1][[1, 3]], BLUE, 2.5)
     if force is not None:
@@ -220,29 +195,28 @@ def _linear_system(env: Any, path: NDArray, force: Any) -> Canvas:
     return canvas
 
 
-def _bars(env: Any, path: NDArray, force: Any) -> Canvas:
+def _bars(env: Any, path: Floats, force: Any) -> Canvas:
     """The present state's components as bars, long as x / (1 + |x|)."""
     canvas = Canvas(-1.6, -1.6, 3.2, PAPER)
     state = path[-1]
     height = min(0.4, 2.4 / len(state))
     top = 0.5 * height * len(state)
     for i, value in enumerate(state):
-        y = top - (i + 0.5) * height
-        end = value / (1.0 + abs(value)) if math.isfinite(value) else 0.0
-        thick = 0.3 * height
+        y, thick = top - (i + 0.5) * height, 0.3 * height
+        end = value / (1.0 + abs(value)) if np.isfinite(value) else 0.0
         canvas.rectangle(-1.0, y - thick, 1.0, y + thick, PALE)
         canvas.rectangle(min(0, end), y - thick, max(0, end), y + thick, BLUE)
-        row = round((1.6 - y) / 3.2 * SIZE)
+        row = round((1.6 - y) / 3.2 * _SIZE)
         canvas.text(8, row, f"s{i}", "lm")
-        canvas.text(SIZE - 8, row, f"{value:.3g}", "rm")
+        canvas.text(_SIZE - 8, row, f"{value:.3g}", "rm")
     canvas.line([(0, -top), (0, top)], GREY, 1)
     canvas.text(12, 10, getattr(env, "name", type(env).__name__))
     return canvas
 
 
-#: An environment's module → what draws it, and how many steps a second to show.
-DRAWINGS: dict[str, tuple[Callable[..., Canvas], int]] = {
-    "bcrl.envs.car_on_hill": (_car_on_hill, 10),
-    "bcrl.envs.maze": (_maze, 10),
-    "bcrl.envs.linear_system": (_linear_system, 20),
+#: An environment's module → its drawing.
+DRAWINGS: dict[str, Callable[..., Canvas]] = {
+    "bcrl.envs.car_on_hill": _car_on_hill,
+    "bcrl.envs.maze": _maze,
+    "bcrl.envs.linear_system": _linear_system,
 }

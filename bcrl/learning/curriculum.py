@@ -1,15 +1,15 @@
-"""Curricula: the order in which a stage sequence visits an environment's tasks."""
+"""Curricula: the order in which the stages of a run visit an environment's tasks."""
 
 from __future__ import annotations
 
 
 def hand_made(n_tasks: int) -> list[int]:
-    """Every task once, easiest first, the target last (`curriculum=on`)."""
+    """Every task once, the easiest first, the target last (`curriculum=on`)."""
     return list(range(n_tasks))
 
 
 def target_only(n_tasks: int) -> list[int]:
-    """The target in every slot (`curriculum=off`)."""
+    """The target in every stage (`curriculum=off`)."""
     return [n_tasks - 1] * n_tasks
 
 

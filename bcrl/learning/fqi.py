@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -10,18 +9,31 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bcrl.common.seeding import stream
+from bcrl.common.serialization import storable
 from bcrl.envs import is_finite, is_simulated
-from bcrl.learning import dataset, rollout
+from bcrl.learning import Floats, dataset, rollout
 from bcrl.learning.bellman import residual_target, shaping
+from bcrl.learning.dataset import Dataset
 from bcrl.learning.stage import SeedBatch, Snapshot, Stage
 from bcrl.learning.transfer import StageInit, StageResult
-from bcrl.q.functions import NOT_FINITE, ZERO, Table, Values, ask
-from bcrl.q.regressors.base import Fitted, FittedQ, Problem, Regressor, fit_each
+from bcrl.q.functions import NOT_FINITE, ZERO, Q, Table, Values, ask
+from bcrl.q.regressors.base import Cell, Fitted, FittedQ, Problem, Regressor, fit_each
+
+
+@storable
+@dataclass(frozen=True)
+class FQIState:
+    """What FQI needs to resume after an iteration; the models are fitted anew."""
+
+    iteration: int
+    data: list[Dataset]  # S datasets
+    residual: list[Floats] | None  # S arrays (P, A): ϱ at all points
+    failed: dict[int, str]  # seeds that cannot continue, by index, and why
 
 
 @dataclass(frozen=True)
 class Iteration(Snapshot):
-    """What FQI knows after one iteration."""
+    """The snapshot after one iteration."""
 
     probed_q: Values  # S arrays (n_probe, A): Q at the probed states
     probed_residual: Values  # S arrays (n_probe, A): ϱ there
@@ -31,18 +43,17 @@ class Iteration(Snapshot):
 class FQI:
     """Fitted Q-iteration for many seeds at once (Ernst et al. 2005; paper, Eq. 5).
 
-    One iteration refits, for every seed and action, a regressor from scratch to
-    `r + γ max_a' Q(s', a') − base(s, a)`. What a stage keeps fixed is computed once:
-    its distinct points, which rows belong to which action, the base's values there,
-    what shaping adds to the rewards.
+    Every iteration fits, for each seed and action, a new regressor to
+    r + γ max_a' Q(s', a') − base(s, a). All that is constant within a stage is computed
+    once: the distinct points, each action's rows, the base's values, shaped rewards.
     """
 
     iterations: int
     episodes: int
     regressor: Regressor
-    epsilon: float = 1.0  # the data's exploration, ε-greedy on the Q learned so far
-    new_data: bool = True  # else the previous stage's data are learned from again
-    shared_data: bool = False  # [released] one dataset a task for all seeds
+    epsilon: float = 1.0  # of the ε-greedy data collection with the previous Q
+    new_data: bool = True  # False: learn from the previous stage's data again
+    shared_data: bool = False  # [released] one dataset per task for all seeds
     fixed_trees: bool = False  # [released] the same randomness in every fit of a seed
 
     name: ClassVar[str] = "fqi"
@@ -53,132 +64,98 @@ class FQI:
         return self.iterations
 
     def learn(
-        self, stage: Stage, start: StageInit, team: SeedBatch, state: Any = None
+        self, stage: Stage, start: StageInit, batch: SeedBatch, state: Any = None
     ) -> Iterator[Iteration]:
         """Learn a stage, ϱ ← S(T(base + ϱ) − base); yields after each iteration."""
-        done, sets, residual, failed = state or (0, *self._data(stage, start, team))
-        env, points = stage.env, [d.points for d in sets]
-        base, lost = ask(start.base, points, env.n_actions)
-        failed = lost | failed
-        if residual is None:
-            residual, lost = ask(start.initial, points, env.n_actions)
+        env, n_actions = stage.env, stage.env.n_actions
+        state = state or self._collect(stage, start, batch)
+        data, failed = state.data, state.failed
+
+        def at_points(q: Q) -> list[Floats]:  # S arrays (P, A)
+            nonlocal failed
+            values, lost = ask(q, [d.points for d in data], n_actions)
             failed = lost | failed
-        potential, lost = ask(start.potential, points, env.n_actions)
-        failed = lost | failed
-        potential_value = [v.max(-1) for v in potential]
-        rewards = [
+            return values
+
+        base = at_points(start.base)
+        residual = state.residual or at_points(start.initial)
+        potential = [v.max(-1) for v in at_points(start.potential)]  # S arrays (P,)
+        reward = [  # S arrays (n,)
             d.reward + shaping(v[d.state], v[d.next_state], d.absorbing, env.gamma)
-            for d, v in zip(sets, potential_value, strict=True)
+            for d, v in zip(data, potential, strict=True)
         ]
-        models = (
+        models: list[list[Fitted | None]] = (
             [list(row) for row in start.initial.models]
             if isinstance(start.initial, FittedQ)
-            else [[None] * env.n_actions for _ in sets]
+            else [[None] * n_actions for _ in data]
         )
-        # With noise no state comes twice; the next stage's base should not remember.
+        # Q-values are not cached if noise makes every state new, nor in the Q-function
+        # that the next stage uses as its base.
         noisy = env.step_noise or is_simulated(env)
         pointwise = getattr(self.regressor, "pointwise", False)
-        evaluated = start.memoized() if pointwise and not noisy else start
-        for k in range(done + 1, self.iterations + 1):
-            residual = [values.copy() for values in residual]
-            problems = self._problems(stage, k, team, rewards, sets, base, residual)
-            # A seed that failed keeps its last good ϱ; nobody learns from it any more.
-            problems = {
-                cell: p for cell, p in problems.items() if cell[0] not in failed
-            }
-            keep = not is_finite(env)  # a table is never asked between its points
-            fits, lost = fit_each(self.regressor, problems, keep, team.threads)
+        cached = start.memoized() if pointwise and not noisy else start
+        for k in range(state.iteration + 1, self.iterations + 1):
+            problems: dict[Cell, Problem] = {}
+            for s, d in enumerate(data):
+                if s in failed:  # a failed seed keeps its last finite ϱ
+                    continue
+                q = base[s] + residual[s]  # (P, A)
+                base_sa = base[s][d.state, d.action]  # (n,)
+                y = residual_target(
+                    reward[s], d.absorbing, q[d.next_state], base_sa, env.gamma
+                )
+                for a, part in enumerate(d.by_action):
+                    path = () if self.fixed_trees else (stage.number, k, a)
+                    fitted_to = (part.x, y[part.rows], part.multiplicity, part.queries)
+                    if len(part.rows):  # an action that was never tried has no model
+                        problems[s, a] = Problem(*fitted_to, batch.seeds[s], path)
+            keep = not is_finite(env)  # a table is not queried between its points
+            fits, lost = fit_each(self.regressor, problems, keep, batch.threads)
             failed = lost | failed
+            residual = [values.copy() for values in residual]
             for (s, a), fit in fits.items():
-                part, problem = sets[s].by_action[a], problems[s, a]
-                residual[s][sets[s].state[part.rows], a] = fit.fitted
+                part = data[s].by_action[a]
+                residual[s][data[s].state[part.rows], a] = fit.fitted
                 residual[s][part.query_points, a] = fit.queried
-                models[s][a] = Fitted.of(problem, fit)
-            q = [b + r for b, r in zip(base, residual, strict=True)]
+                models[s][a] = Fitted.of(problems[s, a], fit)
+            total = [b + r for b, r in zip(base, residual, strict=True)]
             if start.shape is not None:
-                q = [x + v[:, None] for x, v in zip(q, potential_value, strict=True)]
-            lost = {s for s, x in enumerate(q) if not np.isfinite(x).all()}
-            failed = dict.fromkeys(lost, NOT_FINITE) | failed
+                total = [q + v[:, None] for q, v in zip(total, potential, strict=True)]
+            bad = [s for s, q in enumerate(total) if not np.isfinite(q).all()]
+            failed = dict.fromkeys(bad, NOT_FINITE) | failed
             if is_finite(env):
-                learned = StageResult(Table(q, env), Table(residual, env), sets)
+                result = StageResult(Table(total, env), Table(residual, env), data)
             else:
-                own = FittedQ([tuple(row) for row in models], self.regressor, team)
-                whole = start if k == self.iterations else evaluated
-                learned = StageResult(whole.whole(own), own, sets)
+                own = FittedQ([tuple(row) for row in models], self.regressor, batch)
+                last = start if k == self.iterations else cached
+                result = StageResult(last.total(own), own, data)
             yield Iteration(
                 stage,
                 stage.before + k,
-                functools.partial(_state, k, sets, residual, failed),
-                k == self.iterations,
-                learned,
-                [values[d.probe] for values, d in zip(q, sets, strict=True)],
-                [values[d.probe] for values, d in zip(residual, sets, strict=True)],
+                FQIState(k, data, residual, failed),
+                result,
+                [q[d.probe] for q, d in zip(total, data, strict=True)],
+                [r[d.probe] for r, d in zip(residual, data, strict=True)],
                 failed=failed,
             )
 
-    def _data(
-        self, stage: Stage, start: StageInit, team: SeedBatch
-    ) -> tuple[list[dataset.Dataset], None, dict[int, str]]:
-        """Each seed's dataset of ε-greedy episodes, no ϱ yet, which seeds failed."""
-        previous = start.previous
+    def _collect(self, stage: Stage, start: StageInit, batch: SeedBatch) -> FQIState:
+        """The state before the first iteration, with a dataset for each seed."""
+        previous, n = start.previous, len(batch.seeds)
         if not self.new_data and previous is not None:
-            return previous.data, None, {}
+            return FQIState(0, previous.data, None, {})
         if self.shared_data:
             rngs = [stream(0, "shared_data", stage.task)]
         else:
-            rngs = [stream(seed, "data", stage.number) for seed in team.seeds]
-        env, episodes = stage.env, self.episodes
-        begin = np.stack([rollout.start_states(rng, env, episodes) for rng in rngs])
-        u = np.stack([rollout.draws(rng, env, episodes) for rng in rngs])
+            rngs = [stream(seed, "data", stage.number) for seed in batch.seeds]
+        first, u = rollout.starts_and_draws(rngs, stage.env, self.episodes)
         q = ZERO if previous is None else previous.q
-        played = rollout.rollout(env, q, begin, u, self.epsilon)
-        sets = [dataset.build(env, played, s, team.probe) for s in range(len(rngs))]
-        if not self.shared_data:
-            return sets, None, played.failed
-        n = len(team.seeds)
-        return (
-            sets * n,
-            None,
-            {s: why for s in range(n) for why in played.failed.values()},
-        )
-
-    def _problems(
-        self,
-        stage: Stage,
-        k: int,
-        team: SeedBatch,
-        rewards: Values,
-        sets: list[dataset.Dataset],
-        base: Values,
-        residual: Values,
-    ) -> dict[tuple[int, int], Problem]:
-        """Iteration k's regressions by (seed, action); none for an untried action."""
-        problems: dict[tuple[int, int], Problem] = {}
-        for s, d in enumerate(sets):
-            q = base[s] + residual[s]
-            y = residual_target(
-                rewards[s],
-                d.absorbing,
-                q[d.next_state],
-                base[s][d.state, d.action],
-                stage.env.gamma,
-            )
-            for a, part in enumerate(d.by_action):
-                if len(part.rows):
-                    path = () if self.fixed_trees else (stage.number, k, a)
-                    problems[s, a] = Problem(
-                        part.x,
-                        y[part.rows],
-                        part.multiplicity,
-                        part.queries,
-                        team.seeds[s],
-                        path,
-                    )
-        return problems
-
-
-def _state(
-    k: int, sets: list[dataset.Dataset], residual: Values, failed: dict[int, str]
-) -> tuple:
-    """What FQI needs to go on after iteration k: no model, the next fits anew."""
-    return k, sets, residual, failed
+        episodes = rollout.rollout(stage.env, q, first, u, self.epsilon)
+        data = [
+            dataset.build(stage.env, episodes, s, batch.probe) for s in range(len(rngs))
+        ]
+        failed = episodes.failed
+        if self.shared_data:
+            data *= n
+            failed = {s: why for s in range(n) for why in failed.values()}
+        return FQIState(0, data, None, failed)

@@ -11,24 +11,37 @@ from numpy.typing import NDArray
 
 from bcrl.common.arrays import ndtri
 from bcrl.common.seeding import stream
+from bcrl.common.serialization import storable
 from bcrl.envs.base import ContinuousEnv, Env
 from bcrl.errors import ConfigError
-from bcrl.learning.rollout import Policy, play, start_states
+from bcrl.learning import Floats
+from bcrl.learning.rollout import Policy, play, starts_and_draws
 from bcrl.learning.stage import SeedBatch, Stage, StepSnapshot
 from bcrl.learning.transfer import StageInit, StageResult
 from bcrl.q.functions import ZERO, Q
 from bcrl.q.quadratic import Quadratic, features
 
 
+@storable
+@dataclass(frozen=True)
+class LSPIState:
+    """What LSPI needs to resume after an iteration."""
+
+    iteration: int
+    gain: Floats  # (S, k, d) K of the policy a = K s
+    q: Q
+    failed: dict[int, str]  # seeds without a stabilising gain, by index, and why
+
+
 @dataclass(frozen=True)
 class LSPI:
-    """Policy iteration on a = K s + noise, K = 0 at first (paper, C.3).
+    """Policy iteration on a = K s + noise, initially K = 0 (paper, C.3).
 
     Each iteration collects its share of the `steps` in whole episodes with the current
-    gain, solves LSTDQ on them alone and sets K ← −Quu⁻¹ Qus. `features`: see
+    gain, solves LSTDQ on these alone and sets K ← −Quu⁻¹ Qus. `features`: see
     `bcrl.q.quadratic`. `drop_last` leaves each episode's last step out [released]. A
-    gain that is not finite, or pushes away from the goal (a force grows with its
-    position), fails its seed.
+    seed fails if its gain is not finite, or if a force grows with its position, away
+    from the goal.
     """
 
     iterations: int = 4
@@ -46,126 +59,110 @@ class LSPI:
         return self.steps
 
     def episodes_per_iteration(self, env: Env) -> int:
-        """Episodes per iteration; ConfigError unless `steps` are whole ones."""
-        whole, rest = divmod(self.steps, self.iterations * env.horizon)
-        if rest or not whole:
+        """Episodes per iteration; ConfigError unless `steps` are whole episodes."""
+        episodes, rest = divmod(self.steps, self.iterations * env.horizon)
+        if rest or not episodes:
             why = f"LSPI needs a multiple of {self.iterations} iterations"
             why += f" x {env.horizon} steps"
             raise ConfigError("algorithm.steps", self.steps, why)
-        return whole
+        return episodes
 
     def learn(
-        self, stage: Stage, start: StageInit, team: SeedBatch, state: Any = None
+        self, stage: Stage, start: StageInit, batch: SeedBatch, state: Any = None
     ) -> Iterator[StepSnapshot]:
         """Learn an LQ task; yields before the first and after each iteration."""
-        env, n = stage.env, len(team.seeds)
-        k = env.actions.shape[1]
-        failed: dict[int, str] = {}
-        done, gain, q = -1, np.zeros((n, k, env.state_dim)), ZERO
-        if state is not None:
-            done, gain, q, failed = state
-        for iteration in range(done + 1, self.iterations + 1):
-            if iteration:
-                z, after, reward = self._collect(stage, gain, iteration, team)
-                theta = [
-                    lstdq(*(part[s] for part in (z, after, reward)), env.gamma, self)
-                    for s in range(n)
-                ]
-                m = env.state_dim + k
-                q = Quadratic.from_weights(
-                    np.stack(theta), self.features, m, env.actions
-                )
-                for s in range(n):
-                    found = improved(q.matrix[s], env)
-                    if found is None:
-                        why = f"LSPI found no stabilising gain in iteration {iteration}"
-                        failed.setdefault(s, why)
-                    gain[s] = 0.0 if found is None else found
-            yield self._moment(stage, (iteration, gain.copy(), q, dict(failed)))
+        env: Any = stage.env
+        n, d, k = len(batch.seeds), env.state_dim, env.actions.shape[1]
+        if state is None:
+            state = LSPIState(0, np.zeros((n, k, d)), ZERO, {})
+            yield self._snapshot(stage, state)
+        for i in range(state.iteration + 1, self.iterations + 1):
+            z, next_z, reward = self._collect(stage, state.gain, i, batch)
+            transitions = zip(z, next_z, reward, strict=True)
+            theta = [lstdq(*x, env.gamma, self.features) for x in transitions]
+            q = Quadratic.from_weights(
+                np.stack(theta), self.features, d + k, env.actions
+            )
+            better = [improved(matrix, env) for matrix in q.matrix]
+            gain = np.stack([np.zeros((k, d)) if x is None else x for x in better])
+            why = f"LSPI found no stabilising gain in iteration {i}"
+            lost = [s for s, x in enumerate(better) if x is None]
+            failed = dict.fromkeys(lost, why) | state.failed
+            state = LSPIState(i, gain, q, failed)
+            yield self._snapshot(stage, state)
 
-    def _moment(
-        self, stage: Stage, state: tuple[int, NDArray, Q, dict[int, str]]
-    ) -> StepSnapshot:
-        iteration, gain, q, failed = state
-        policy = _linear(gain)  # evaluated without noise, so greedy is the same
+    def _snapshot(self, stage: Stage, state: LSPIState) -> StepSnapshot:
         return StepSnapshot(
             stage,
-            stage.before + iteration * self.length // self.iterations,
-            lambda: state,
-            iteration == self.iterations,
-            StageResult(q, q),
-            policy,
+            stage.before + state.iteration * self.length // self.iterations,
+            state,
+            StageResult(state.q, state.q),
+            _linear(state.gain),  # without noise, so its exploring half is greedy, too
             self.evaluation_episodes,
-            np.full(len(gain), np.nan),
-            failed=failed,
+            np.full(len(state.gain), np.nan),
+            failed=state.failed,
         )
 
     def _collect(
-        self, stage: Stage, gain: NDArray, iteration: int, team: SeedBatch
-    ) -> tuple[NDArray, NDArray, NDArray]:
+        self, stage: Stage, gain: Floats, iteration: int, batch: SeedBatch
+    ) -> tuple[Floats, Floats, Floats]:
         """Each seed's (s, a) (S, n, m), next (s', K s') and rewards (S, n)."""
         env, k = stage.env, gain.shape[1]
-        episodes = self.episodes_per_iteration(env)
-        rngs = [stream(x, "data", stage.number, iteration) for x in team.seeds]
-        begin = np.stack([start_states(rng, env, episodes) for rng in rngs])
-        shape = (env.horizon, episodes, k + env.step_noise)
-        u = np.stack([rng.random(shape) for rng in rngs])
-        played = play(env, _linear(gain, self.noise_std), begin, u)
+        rngs = [stream(x, "data", stage.number, iteration) for x in batch.seeds]
+        start, u = starts_and_draws(rngs, env, self.episodes_per_iteration(env), k)
+        episodes = play(env, _linear(gain, self.noise_std), start, u)
         cut = env.horizon - 1 if self.drop_last else env.horizon
-        before, after = played.state[:, :, :cut], played.state[:, :, 1 : cut + 1]
-        z = np.concatenate([before, played.action[:, :, :cut]], -1)
-        on_policy = np.concatenate([after, _apply(gain, after)], -1)
+        state = episodes.state[:, :, :cut]  # (S, E, T, d)
+        next_state = episodes.state[:, :, 1 : cut + 1]
+        z = np.concatenate([state, episodes.action[:, :, :cut]], -1)  # (S, E, T, m)
+        next_z = np.concatenate([next_state, _apply(gain, next_state)], -1)
         n, m = len(gain), z.shape[-1]
-        reward = played.reward[:, :, :cut].reshape(n, -1)
-        return z.reshape(n, -1, m), on_policy.reshape(n, -1, m), reward
+        reward = episodes.reward[:, :, :cut].reshape(n, -1)
+        return z.reshape(n, -1, m), next_z.reshape(n, -1, m), reward
 
 
-def lstdq(
-    z: NDArray, after: NDArray, reward: NDArray, gamma: float, settings: LSPI
-) -> NDArray[np.float64]:
-    """Weights θ with Φᵀ(Φ − γΦ') θ = Φᵀ r; the pseudo-inverse's if that is singular.
+def lstdq(z: Floats, next_z: Floats, reward: Floats, gamma: float, kind: str) -> Floats:
+    """θ (F,) with Φᵀ(Φ − γΦ') θ = Φᵀ r, by the pseudo-inverse if that is singular.
 
-    z and after (n, m) are state-actions and the policy's at the next states. Data that
-    overflow give nan.
+    z and next_z (n, m): state-actions, and next states with the policy's actions;
+    kind: of the `features`. Data that overflow give nan.
     """
-    phi = features(z, settings.features)
-    a = phi.T @ (phi - gamma * features(after, settings.features))
+    phi = features(z, kind)  # (n, F)
+    a = phi.T @ (phi - gamma * features(next_z, kind))
     b = phi.T @ reward
     if not np.isfinite(a).all() or not np.isfinite(b).all():
         return np.full(len(b), np.nan)
-    if np.linalg.matrix_rank(a) == len(a):
-        return np.linalg.solve(a, b)
-    return np.linalg.pinv(a) @ b
+    full = np.linalg.matrix_rank(a) == len(a)
+    theta: Any = np.linalg.solve(a, b) if full else np.linalg.pinv(a) @ b
+    return theta
 
 
-def _apply(gain: NDArray, state: NDArray) -> NDArray[np.float64]:
+def _apply(gain: Floats, state: Floats) -> Floats:
     """K s of states (S, …, d) for gains (S, k, d), shape (S, …, k)."""
     lanes = gain.reshape(len(gain), *[1] * (state.ndim - 2), *gain.shape[1:])
     return (lanes * state[..., None, :]).sum(-1)
 
 
-def _linear(gain: NDArray, noise_std: float = 0.0) -> Policy:
-    """The policy a = K s + N(0, noise_std²), its first uniforms being the noise's."""
+def _linear(gain: Floats, noise_std: float = 0.0) -> Policy:
+    """The policy a = K s + N(0, noise_std²); its first uniforms are the noise's."""
 
-    def act(now: NDArray, u: NDArray, alive: NDArray) -> NDArray:
-        force = _apply(gain, now)
-        return (
-            force + noise_std * ndtri(u[..., : gain.shape[1]]) if noise_std else force
-        )
+    def act(states: NDArray, u: NDArray, alive: NDArray) -> NDArray:
+        force = _apply(gain, states)
+        if not noise_std:
+            return force
+        return force + noise_std * ndtri(u[..., : gain.shape[1]])
 
     return act
 
 
-def improved(
-    matrix: NDArray[np.float64], env: ContinuousEnv
-) -> NDArray[np.float64] | None:
-    """K (k, d) = −Quu⁻¹ Qus of Q = zᵀ `matrix` z; None if no K pulls to the goal.
+def improved(matrix: Floats, env: ContinuousEnv) -> Floats | None:
+    """K (k, d) = −Quu⁻¹ Qus of Q = zᵀ `matrix` z; None unless K pulls to the goal.
 
     Force i must not grow with the position that it moves, `env.positions[i]`.
     """
     d = env.state_dim
     try:
-        gain = -np.linalg.solve(matrix[d:, d:], matrix[d:, :d])
+        gain: Any = -np.linalg.solve(matrix[d:, d:], matrix[d:, :d])
     except np.linalg.LinAlgError:
         return None
     own = gain[range(len(gain)), env.positions]

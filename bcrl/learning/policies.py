@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from bcrl.common.arrays import per_lane
 from bcrl.common.compiling import kept
+from bcrl.learning import Floats, Integers
 
 TIE = 1e-9  # distances between actions that differ by less are equal
 
 
 @numba.njit
 def _best(q, u):
-    """The greatest of q (A,), ties broken by u in [0, 1); 0 where NaN hides it."""
+    """The greatest of q (A,), ties broken by u in [0, 1); 0 if NaN hides it."""
     best, ties = q[0], 1
     for a in range(1, len(q)):
         if q[a] > best:
@@ -36,36 +36,29 @@ def greedy(q, u, action):
     action[0] = _best(q, u)
 
 
-@per_lane("(f8[:], f8, f8, f8, i8[:], b1[:])", "(a),(),(),()->(),()")
-def epsilon_greedy(q, explore, u, epsilon, action, random):
-    """`greedy`, or `uniform` where `explore` (...) is below ε; and where that is so."""
-    random[0] = explore < epsilon
-    action[0] = int(u * len(q)) if random[0] else _best(q, u)
-
-
-def uniform(n_actions: int, u: NDArray[np.float64]) -> NDArray[np.intp]:
+def uniform(n_actions: int, u: Floats) -> Integers:
     """A uniformly random action from each u (...) in [0, 1)."""
     return (u * n_actions).astype(np.intp)
 
 
 def annealed(step: int, first: float, last: float, over: int) -> float:
-    """ε at a step, falling in a straight line from `first` to `last` over `over`."""
+    """ε at a step: it falls linearly from `first` to `last` within `over` steps."""
     return last if step >= over else first + (last - first) * step / over
 
 
-def combined(actions: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Residual policy's table (A, A): what is done for (prior's action, own action).
+def combined_actions(actions: Floats) -> Integers:
+    """The action that RPL executes, table (A, A) over the prior's and the own action.
 
-    The action of `actions` (A, k) nearest to their sum; the own one if they cancel,
-    and among equally near ones the one nearest to the own (paper, C.3).
+    It is the action of `actions` (A, k) nearest to their sum; the own action if they
+    cancel, and among equally near ones the one nearest to the own. Source: paper, C.3.
     """
-    aim = actions[:, None] + actions[None]
-    off = np.linalg.norm(aim[:, :, None] - actions, axis=-1)
-    from_own = np.linalg.norm(actions[:, None] - actions, axis=-1)
-    near = off <= off.min(-1, keepdims=True) + TIE
-    table = np.where(near, from_own[None], np.inf).argmin(-1)
+    total = actions[:, None] + actions[None]  # (A, A, k)
+    distance = np.linalg.norm(total[:, :, None] - actions, axis=-1)  # (A, A, A)
+    from_own = np.linalg.norm(actions[:, None] - actions, axis=-1)  # (A, A)
+    nearest = distance <= distance.min(-1, keepdims=True) + TIE
+    table = np.where(nearest, from_own[None], np.inf).argmin(-1)
     own = np.broadcast_to(np.arange(len(actions)), table.shape)
-    return np.where(np.linalg.norm(aim, axis=-1) < TIE, own, table)
+    return np.where(np.linalg.norm(total, axis=-1) < TIE, own, table)
 
 
 @kept(nogil=True)
@@ -74,7 +67,7 @@ def walk(next_row, reward, absorbing, q, first, u, epsilon):
 
     next_row, reward, absorbing, q: tables (N, A); u: uniforms (T, E, 2 or more).
     Returns rows (E, T + 1), actions (E, T) and lengths (E,). It stands beside `_best`
-    because numba's cache of a file doesn't see changes of another.
+    because numba's cache of one file does not see changes of another.
     """
     horizon, episodes = u.shape[0], u.shape[1]
     n_actions = q.shape[1]

@@ -1,17 +1,15 @@
-"""A stage: a task, a learner with its budget, and what is transferred into it."""
+"""A stage is a task, a learner with its budget, and the transfers into it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
 
 from bcrl.common.serialization import storable
 from bcrl.envs import Env
 from bcrl.errors import BcrlError
+from bcrl.learning import Floats
 from bcrl.learning.rollout import Policy
 from bcrl.learning.transfer import StageInit, StageResult, Transfer, begin
 from bcrl.q.functions import ZERO
@@ -19,31 +17,35 @@ from bcrl.q.functions import ZERO
 
 @dataclass(frozen=True)
 class SeedBatch:
-    """The seeds that train together, and what they have to do it with."""
+    """The seeds that train together, and what they share."""
 
     seeds: tuple[int, ...]
-    probe: NDArray[np.float64]  # (n_probe, d) states at which Q is looked at
+    probe: Floats  # (n_probe, d) states at which Q is recorded
     threads: int = 1
     device: str = "cpu"
 
 
 @dataclass(frozen=True)
 class Pause:
-    """A moment at which learning may be interrupted and gone on with later."""
+    """A point at which learning can be interrupted and resumed."""
 
     stage: Stage
-    count: int  # iterations or environment steps, over the whole run
-    state: Callable[[], Any]  # what the learner needs besides the stage and its start
+    count: int  # iterations or environment steps since the run began
+    state: Any  # the learner's state, valid until learning continues
 
 
 @dataclass(frozen=True)
 class Snapshot(Pause):
-    """What a team knows at one moment of a stage."""
+    """A pause at which the learned Q-functions can be evaluated."""
 
-    last_of_stage: bool
-    learned: StageResult
-    #: Which of the S seeds can't go on, by place in the team, and why.
+    result: StageResult
+    #: Seeds that cannot continue, by index in the batch, and why.
     failed: dict[int, str] = field(default_factory=dict, kw_only=True)
+
+    @property
+    def last_of_stage(self) -> bool:
+        """Whether the stage is complete."""
+        return self.count == self.stage.before + self.stage.learner.length
 
 
 @dataclass(frozen=True)
@@ -51,10 +53,10 @@ class StepSnapshot(Snapshot):
     """A snapshot of a learner that counts environment steps."""
 
     policy: (
-        Policy  # of twice `episodes` lanes: explores in half of them, then is greedy
+        Policy  # of 2 · `episodes` lanes: the first half explores, the rest is greedy
     )
     episodes: int
-    loss: NDArray[np.float64]  # (S,) mean since the last moment; nan without updates
+    loss: Floats  # (S,) mean since the last snapshot; nan without updates
 
 
 class Learner(Protocol):
@@ -64,15 +66,14 @@ class Learner(Protocol):
 
     @property
     def length(self) -> int:
-        """Iterations or environment steps that a stage takes."""
+        """Iterations or environment steps of a stage."""
 
     def learn(
-        self, stage: Stage, start: StageInit, team: SeedBatch, state: Any = None
+        self, stage: Stage, start: StageInit, batch: SeedBatch, state: Any = None
     ) -> Iterator[Pause]:
-        """Learn `stage` from `start`, yielding whenever there is something to see.
+        """Learn `stage` from `start`; yields pauses, the last one a `Snapshot`.
 
-        The last pause is a snapshot. `state`: a pause's, to go on from it; what comes
-        is then the same as if there had been no interruption.
+        With the `state` of a pause it resumes there, as if never interrupted.
         """
 
 
@@ -84,72 +85,72 @@ class Stage:
     task: int  # position in the environment's task sequence, from 1
     env: Env
     learner: Learner
-    transfers: tuple[Transfer, ...]  # from the stage before
-    before: int  # iterations or environment steps of the stages before
+    transfers: tuple[Transfer, ...]  # from the previous stage
+    before: int  # iterations or environment steps of all previous stages
 
 
 @storable
 @dataclass(frozen=True)
 class RunState:
-    """Where a run is: how many stages are done, what they left, and the next's state.
+    """A run's state: stages completed, the last one's result, the next one's state.
 
-    It refers to what is being learned, so store it before learning goes on.
+    The state is not a copy: store it before learning continues.
     """
 
     stages: int
-    learned: StageResult | None
+    result: StageResult | None
     state: Any = None
 
 
 class CurriculumRun:
-    """Stages learned in order, each started by its transfers from the one before."""
+    """Learns stages in order; transfers start each one from the result before it."""
 
     def __init__(
-        self, stages: Sequence[Stage], team: SeedBatch, past: RunState | None = None
+        self, stages: Sequence[Stage], batch: SeedBatch, state: RunState | None = None
     ) -> None:
-        self.stages, self.team = stages, team
-        self._past = past or RunState(0, None)
-        self._now: Pause | None = None
+        self.stages, self.batch = stages, batch
+        self._completed = state or RunState(0, None)  # when the present stage began
+        self._pause: Pause | None = None
 
     def __iter__(self) -> Iterator[Pause]:
-        for stage in self.stages[self._past.stages :]:
-            start, state = begin(stage.transfers, self._past.learned), self._past.state
-            now = None
-            for now in stage.learner.learn(stage, start, self.team, state):
-                self._now = now
-                yield now
-            if not (isinstance(now, Snapshot) and now.last_of_stage):
-                text = "must yield a last Snapshot, with last_of_stage=True"
+        for stage in self.stages[self._completed.stages :]:
+            start = begin(stage.transfers, self._completed.result)
+            state, pause = self._completed.state, None
+            for pause in stage.learner.learn(stage, start, self.batch, state):
+                self._pause = pause
+                yield pause
+            if not (isinstance(pause, Snapshot) and pause.last_of_stage):
                 name = getattr(stage.learner, "name", type(stage.learner).__name__)
-                raise BcrlError(f"{name}.learn: stage {stage.number} {text}")
-            self._past = RunState(stage.number, now.learned)
+                why = "must end with a Snapshot whose last_of_stage is true"
+                raise BcrlError(f"{name}.learn: stage {stage.number} {why}")
+            self._completed = RunState(stage.number, pause.result)
 
     @property
-    def past(self) -> RunState:
-        """All that it takes to go on from the latest pause."""
-        now = self._now
-        if now is None:
-            return self._past
-        if isinstance(now, Snapshot) and now.last_of_stage:
-            return RunState(now.stage.number, now.learned)
-        return replace(self._past, state=now.state())
+    def state(self) -> RunState:
+        """What a new `CurriculumRun` needs to resume from the latest pause."""
+        pause = self._pause
+        if pause is None:
+            return self._completed
+        if isinstance(pause, Snapshot) and pause.last_of_stage:
+            return RunState(pause.stage.number, pause.result)
+        return replace(self._completed, state=pause.state)
 
     @property
     def given(self) -> list[Any]:
-        """What a stored `past` refers to: settings and environments, the team."""
+        """What a stored `state` refers to and does not contain: settings, tasks."""
         settings = (
             part
             for stage in self.stages
             for part in (stage.env, *vars(stage.learner).values())
         )
-        return [ZERO, self.team, *settings]
+        return [ZERO, self.batch, *settings]
 
 
 def snapshots(pauses: Iterable[Pause]) -> Iterator[Snapshot]:
-    """Those of the pauses at which there is something to see."""
-    return (now for now in pauses if isinstance(now, Snapshot))
+    """The pauses that are snapshots."""
+    return (pause for pause in pauses if isinstance(pause, Snapshot))
 
 
-def learn(stages: Sequence[Stage], team: SeedBatch) -> Iterator[Snapshot]:
-    """The snapshots of a whole course."""
-    return snapshots(CurriculumRun(stages, team))
+def learn(stages: Sequence[Stage], batch: SeedBatch) -> Iterator[Snapshot]:
+    """The snapshots of a whole run."""
+    return snapshots(CurriculumRun(stages, batch))

@@ -1,7 +1,7 @@
-"""Transfers: how what the previous stage learned enters the next one.
+"""Transfers: how the result of one stage enters the next.
 
-A transfer edits the next stage's `StageInit`; several may be in force at once, e.g.
-`Boost` and `Shape` make SBC-DQN. Learners read only the `StageInit` of the variant.
+A transfer edits the next stage's `StageInit`. Several can be combined: `Boost` and
+`Shape` make SBC-DQN. Learners read only the `StageInit`.
 """
 
 from __future__ import annotations
@@ -12,27 +12,27 @@ from typing import Any
 
 from bcrl.common.serialization import storable
 from bcrl.errors import ConfigError, at_least
-from bcrl.q.functions import ZERO, Q, Shaped, add, memoized
+from bcrl.q.functions import ZERO, Q, Shaped, Sum, add, memoized
 
 
 @storable
 @dataclass(frozen=True)
 class StageResult:
-    """What a stage leaves behind."""
+    """What a stage has learned."""
 
-    q: Q  # of the stage's own task: base + ϱ, and the potential if rewards were shaped
-    residual: Q  # ϱ, the approximator, to go on from
-    data: Any = None  # transitions that the next stage may learn from once more
+    q: Q  # of the stage's task: base + ϱ, plus the potential if rewards were shaped
+    residual: Q  # ϱ, the approximator; `warm_start` trains it further
+    data: Any = None  # transitions that the next stage may learn from again
 
 
 @dataclass(frozen=True)
 class Boost:
-    """The previous Q is frozen and a new residual is learned on it (B-; Eq. 5).
+    """The previous Q is frozen as the base of a new residual (B-; paper, Eq. 5).
 
-    `greedy_on` the `sum` base + ϱ or the `residual`; the target bootstraps with `one`
-    maximum of the sum or with `two`, max ϱ + max base; `mask_at_goal`: whether the base
-    counts for nothing in an absorbing next state. The defaults are the paper's, the
-    released BC-DQN has residual, two and false.
+    `greedy_on`: the policy is greedy on the `sum` base + ϱ or on the `residual` ϱ.
+    `maxima`: the target bootstraps with `one` maximum, that of the sum, or with `two`,
+    max ϱ + max base. `mask_at_goal`: the base does not count in absorbing next states.
+    The defaults are the paper's; the released BC-DQN has residual, two and false.
     """
 
     greedy_on: str = "sum"
@@ -45,11 +45,11 @@ class Boost:
 
 @dataclass(frozen=True)
 class Shape:
-    """Reward + γ V(s') − V(s) in training, V = max_a of the previous Q (S-; Ng 1999).
+    """Training rewards are r + γ V(s') − V(s), V = max_a previous Q (S-; Ng 1999).
 
-    `next_state`: V(s') is taken where the transition is `stored` to lead, or
-    `before_reset`; `zero_at_goal`: whether V is zero in an absorbing next state. The
-    released shaping has before_reset and false.
+    `next_state`: s' is the `stored` next state, or the one `before_reset`.
+    `zero_at_goal`: V is zero in absorbing next states. The released shaping has
+    before_reset and false.
     """
 
     next_state: str = "stored"
@@ -63,8 +63,8 @@ class Shape:
 class PolicyReuse:
     """In step t the previous greedy policy acts with probability ν^t (PPR).
 
-    Fernández and Veloso (2006) as read by Brys et al. (2015). Raises ConfigError for ν
-    outside [0, 1].
+    Raises ConfigError for ν outside [0, 1]. Source: Fernández and Veloso (2006), in the
+    version of Brys et al. (2015).
     """
 
     nu: float = 0.998
@@ -79,10 +79,10 @@ class PolicyReuse:
 
 @dataclass(frozen=True)
 class ResidualPolicy:
-    """The executed action is the one nearest to prior's + own action (RPL).
+    """The executed action is the one nearest to the prior's + the own action (RPL).
 
-    Silver et al. (2018). For the first `offset` steps that are not random the own
-    action copies the prior's. Raises ConfigError for a negative offset.
+    In the first `offset` greedy decisions the own action copies the prior's. Raises
+    ConfigError for a negative offset. Source: Silver et al. (2018).
     """
 
     offset: int = 2000
@@ -96,25 +96,25 @@ class ResidualPolicy:
 
 @dataclass(frozen=True)
 class StageInit:
-    """What a stage starts from: it learns ϱ from `initial` on, and Q = base + ϱ."""
+    """What a stage starts from: it trains ϱ, initially `initial`, and Q = base + ϱ."""
 
     previous: StageResult | None = None
     base: Q = ZERO
     initial: Q = ZERO
-    boost: Boost = Boost()  # how the base is used; of no effect where it is zero
+    boost: Boost = Boost()  # how the base is used; no effect with a zero base
     potential: Q = ZERO
-    shape: Shape | None = None  # None: rewards as they are
+    shape: Shape | None = None  # None: rewards are not shaped
     prior: Q = ZERO
     behavior: PolicyReuse | ResidualPolicy | None = None  # None: the own policy acts
 
-    def whole(self, residual: Q) -> Q:
-        """Q = base + `residual`, with what shaping took off the rewards put back."""
+    def total(self, residual: Q) -> Q:
+        """Q = base + `residual`, plus the potential if rewards are shaped."""
         if self.shape is None:
             return add(self.base, residual)
         return Shaped(self.base, residual, self.potential)
 
     def memoized(self) -> StageInit:
-        """The same start, its base and potential asked only once at each state."""
+        """The same with a base and a potential that cache their values."""
         base = memoized(self.base)
         same = self.potential is self.base
         potential = base if same else memoized(self.potential)
@@ -125,14 +125,14 @@ Transfer = Callable[[StageInit, StageResult], StageInit]
 
 
 def warm_start(start: StageInit, previous: StageResult) -> StageInit:
-    """The approximator goes on from where the previous stage left it (C-)."""
+    """The previous stage's approximator is trained further (C-)."""
     return replace(start, initial=previous.residual)
 
 
 def begin(transfers: Sequence[Transfer], previous: StageResult | None) -> StageInit:
-    """The start of a stage; without a previous stage there is nothing to transfer.
+    """The start of a stage, by all transfers in order; a first stage has none.
 
-    Raises ConfigError for a transfer that returns something else than a `StageInit`.
+    Raises ConfigError for a transfer that does not return a `StageInit`.
     """
     start = StageInit(previous)
     if previous is not None:
@@ -140,23 +140,18 @@ def begin(transfers: Sequence[Transfer], previous: StageResult | None) -> StageI
             start = transfer(start, previous)
             if not isinstance(start, StageInit):
                 why = "must return a StageInit (bcrl.learning.transfer), returned "
-                why += f"{start!r:.80}"
-                raise ConfigError("transfer", transfer, why)
+                raise ConfigError("transfer", transfer, f"{why}{start!r:.80}")
     return start
 
 
-def _any(states: Any, n_actions: int) -> Any:
-    """A Q-function to try transfers on: 0 everywhere, but not `ZERO`."""
-    return ZERO(states, n_actions)
-
-
 def tried(transfers: Sequence[Transfer]) -> StageInit | None:
-    """What transfers make of a start; None if they need a Q that was learned."""
+    """The start that `transfers` make of zero Q-functions; None if they need others."""
+    zero = Sum((ZERO,))  # not `ZERO`, which stands for no transfer
     try:
-        return begin(transfers, StageResult(_any, _any))
+        return begin(transfers, StageResult(zero, zero))
     except ConfigError:
         raise
-    except Exception:  # a transfer of the user's that reads, say, a network's weights
+    except Exception:  # a user's transfer that reads, for example, network weights
         return None
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.common.serialization import storable
-from bcrl.envs import Env, FiniteEnv
+from bcrl.envs import FiniteEnv
 from bcrl.errors import BcrlError, LostSeeds
 
 Values = Sequence[NDArray[np.float64]]
@@ -18,9 +18,10 @@ NOT_FINITE = "Q is not finite"  # why a seed failed
 
 
 class Q(Protocol):
-    """Q-functions of S seeds; seed s is asked at its own states.
+    """Q-functions of S seeds; each seed has its own states.
 
-    S arrays may be one stacked array (S, n, d); the values are stacked then, too.
+    The S arrays of states may be one stacked array (S, n, d); then the values are
+    stacked, too.
     """
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
@@ -36,35 +37,36 @@ def each(states: Sequence[NDArray], values: Callable[[int], NDArray]) -> Values:
 def check_width(states: Sequence[NDArray], d: int) -> None:
     """Raise BcrlError unless all states have the `d` entries that a Q was learned on.
 
-    Compiled code would read what lies beside a shorter state.
+    Compiled code would read memory beside a shorter state.
     """
-    stacked = isinstance(states, np.ndarray)
-    for width in {x.shape[-1] for x in ((states,) if stacked else states)}:
+    for width in {x.shape[-1] for x in states}:
         if width != d:
-            why = "a simulator's observations are its states, not what resets it"
-            raise BcrlError(f"Q of states with {d} entries asked at {width}: {why}")
+            raise BcrlError(
+                f"a Q-function of states with {d} entries can't be evaluated at states "
+                f"with {width}; pass a simulator's observations, not what resets it"
+            )
 
 
 def rows_of(env: FiniteEnv, state: NDArray[np.float64]) -> NDArray[np.intp]:
     """The row of each state (..., d) in `env.states()`; BcrlError if there is none."""
     row = np.asarray(env.index(state))
     if row.size and not 0 <= row.min() <= row.max() < len(env.states()):
-        raise BcrlError(f"{env}: index gives rows that states() doesn't have")
+        raise BcrlError(f"{env}: index() returns rows that states() doesn't have")
     return row
 
 
 def ask(
     q: Q, states: Sequence[NDArray[np.float64]], n_actions: int
 ) -> tuple[list[NDArray[np.float64]], dict[int, str]]:
-    """Values (n_s, A) of S seeds, and by place why a seed's can't be used.
+    """Values (n_s, A) of S seeds, and why seeds failed, by their index in `states`.
 
-    A seed whose Q can't be asked gets zeros; the others' values don't depend on it.
+    A seed whose Q can't be evaluated gets zeros and changes no other seed's values.
     """
     failed: dict[int, str] = {}
     while True:
-        asked = [x[:0] if s in failed else x for s, x in enumerate(states)]
+        queried = [x[:0] if s in failed else x for s, x in enumerate(states)]
         try:
-            values = list(q(asked, n_actions))
+            values = list(q(queried, n_actions))
             break
         except LostSeeds as error:
             if error.reasons.keys() <= failed.keys():
@@ -79,7 +81,7 @@ def ask(
 
 
 class Zero:
-    """Q = 0: what an unfitted approximator predicts."""
+    """Q = 0, what an approximator predicts before its first fit."""
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         if isinstance(states, np.ndarray):
@@ -110,9 +112,10 @@ class Sum:
 @storable
 @dataclass(frozen=True)
 class Shaped:
-    """base + ϱ + max_a' potential(s, a'): undoes what shaping took off the rewards.
+    """base + ϱ + max_a' potential(s, a'), which undoes the shaping of the rewards.
 
-    A base that is the potential, too, is asked once: stages may be stacked on stages.
+    If the base is also the potential, it is evaluated once, because stages may be
+    stacked on stages.
     """
 
     base: Q
@@ -123,10 +126,7 @@ class Shaped:
         base, own = self.base(states, n_actions), self.residual(states, n_actions)
         same = self.potential is self.base
         v = base if same else self.potential(states, n_actions)
-        return each(
-            states,
-            lambda s: base[s] + own[s] + v[s].max(-1, keepdims=True),
-        )
+        return each(states, lambda s: base[s] + own[s] + v[s].max(-1, keepdims=True))
 
 
 def add(base: Q, residual: Q) -> Q:
@@ -138,45 +138,43 @@ def add(base: Q, residual: Q) -> Q:
 
 
 class MemoizedQ:
-    """A frozen Q that is asked once at each state.
+    """A frozen Q that is evaluated once at each state.
 
-    The greedy episodes of an iteration meet most of the states of those before.
+    The greedy episodes of an iteration visit mostly states of earlier iterations.
     """
 
     def __init__(self, q: Q) -> None:
         self.q = q
-        self._known: dict[int, dict[bytes, NDArray[np.float64]]] = {}  # by seed
+        self._values: dict[tuple[int, bytes], NDArray[np.float64]] = {}  # seed, state
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        known = [self._known.setdefault(s, {}) for s in range(len(states))]
-        keys = [[state.tobytes() for state in x] for x in states]
-        new = [
-            [i for i, key in enumerate(row) if key not in found]
-            for row, found in zip(keys, known, strict=True)
-        ]
+        keys = [[(s, state.tobytes()) for state in x] for s, x in enumerate(states)]
+        cached = self._values
+        new = [[i for i, key in enumerate(row) if key not in cached] for row in keys]
         if any(new):
-            asked = [x[rows] for x, rows in zip(states, new, strict=True)]
-            values = self.q(asked, n_actions)
-            for s, rows in enumerate(new):
-                known[s].update(zip((keys[s][i] for i in rows), values[s], strict=True))
-        return each(
-            states,
-            lambda s: np.array([known[s][k] for k in keys[s]]).reshape(-1, n_actions),
-        )
+            queried = [x[rows] for x, rows in zip(states, new, strict=True)]
+            values = self.q(queried, n_actions)
+            for row, rows, found in zip(keys, new, values, strict=True):
+                cached.update(zip((row[i] for i in rows), found, strict=True))
+
+        def values_of(s: int) -> NDArray[np.float64]:
+            return np.array([cached[key] for key in keys[s]]).reshape(-1, n_actions)
+
+        return each(states, values_of)
 
 
 def memoized(q: Q) -> Q:
-    """`q`, asked once at each state; zero costs nothing and stays itself."""
+    """`q`, evaluated once at each state; zero stays itself."""
     return q if q is ZERO else MemoizedQ(q)
 
 
 @storable
 @dataclass(frozen=True)
 class Table:
-    """Tabulated Q of a finite environment: one array (N, A) a seed."""
+    """The Q-table of a finite environment, one array (N, A) per seed."""
 
     values: Sequence[NDArray[np.float64]]
-    env: Env
+    env: FiniteEnv
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         check_width(states, self.env.state_dim)

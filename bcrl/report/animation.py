@@ -10,32 +10,31 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from bcrl.common.files import write_atomically
-from bcrl.envs import Env, is_simulated
+from bcrl.envs import is_simulated
 from bcrl.envs.rendering import draw, frames_per_second
 from bcrl.envs.tasks import tasks_of
 from bcrl.errors import BcrlError, did_you_mean
-from bcrl.report.findings import unreadable
 from bcrl.report.variants import Runs, Variant
+from bcrl.results.read import bad_file
 
-COLOURS = 64  # of a GIF's palette
-PAUSE = 1500  # ms that the last frame stands
-RETURNS = ("greedy_return", "return")  # columns that say how good a policy is
+_COLOURS = 64  # of a GIF's palette
+_PAUSE = 1500  # ms that the last frame stands
+_RETURNS = ("greedy_return", "return")  # columns that say how good a policy is
 
 
 def animations(
-    runs: Runs, out: Path, tag: str | None, asked: Sequence[str] = ()
+    runs: Runs, out: Path, tag: str | None, names: Sequence[str] = ()
 ) -> tuple[list[Path], list[str]]:
     """Write a GIF for each variant chosen; the files, and what was skipped and why.
 
-    `asked`: names of variants (`BC-FQI`); without any, an environment's and family's
-    best. BcrlError if one isn't there.
+    `names` of variants (`BC-FQI`); without any, an environment's and family's best.
+    BcrlError if there is no variant of that name.
     """
     files, skipped = [], []
-    for variant in _chosen(runs, tag, asked):
-        seed = typical_seed(variant)
+    for variant in _chosen(runs, tag, names):
         path = gif_of(runs, variant, out)
         try:
-            shown = list(frames(variant, seed))
+            shown = list(frames(variant, typical_seed(variant)))
             files.append(_write(path, *zip(*shown, strict=True)))
         except BcrlError as error:
             skipped.append(f"{path.name}: {error}")
@@ -49,13 +48,13 @@ def gif_of(runs: Runs, variant: Variant, out: Path) -> Path:
     return out / f"agent_{variant.env}_{variant.name}_{runs.scale}.gif"
 
 
-def _chosen(runs: Runs, tag: str | None, asked: Sequence[str]) -> list[Variant]:
-    if asked:
-        known = {variant.name for variant in runs.variants}
-        for name in asked:
-            if name not in known:
-                raise BcrlError(f"--gif {name}: {did_you_mean(name, known)}")
-        return [variant for variant in runs.variants if variant.name in asked]
+def _chosen(runs: Runs, tag: str | None, names: Sequence[str]) -> list[Variant]:
+    known = {variant.name for variant in runs.variants}
+    for name in names:
+        if name not in known:
+            raise BcrlError(f"--gif {name}: {did_you_mean(name, known)}")
+    if names:
+        return [variant for variant in runs.variants if variant.name in names]
     best: dict[tuple[str, str], Variant] = {}
     for variant in (v for v in runs.variants if tag in (None, v.tag)):
         rival = best.setdefault((variant.env, variant.family), variant)
@@ -71,8 +70,8 @@ def _merit(variant: Variant) -> tuple[bool, bool, float]:
 
 def _last_returns(variant: Variant) -> NDArray[np.float64]:
     """Each seed's return at the end, (S,); zeros if none was measured."""
-    measured = [variant.metrics[name] for name in RETURNS if name in variant.metrics]
-    return measured[0][:, -1] if measured else np.zeros(len(variant.seeds))
+    measured = [variant.last(name) for name in _RETURNS if name in variant.metrics]
+    return measured[0] if measured else np.zeros(len(variant.seeds))
 
 
 def typical_seed(variant: Variant) -> int:
@@ -82,42 +81,27 @@ def typical_seed(variant: Variant) -> int:
 
 
 def frames(variant: Variant, seed: int) -> Iterator[tuple[NDArray[np.uint8], int]]:
-    """The pictures of a seed's recorded episode, and for how long each stands, ms."""
-    states, actions = _recorded(variant, seed)
-    document = variant.sidecars[variant.seeds.index(seed)]
-    env = tasks_of(document["config"]["env"])[-1]
-    if states.shape[1:] != (env.state_dim,):
-        what = (
-            f"has a trajectory of shape {states.shape}, expected (T, {env.state_dim})"
-        )
-        raise unreadable(variant.npz(seed), what)
-    duration = 1000 // frames_per_second(env)
+    """The T + 1 pictures of a seed's recorded episode, and how long each stands, ms."""
+    states, actions = variant.arrays(seed, "trajectory", "trajectory_actions")
+    env = tasks_of(variant.sidecars[variant.seeds.index(seed)]["config"]["env"])[-1]
+    if states.shape != (len(actions) + 1, env.state_dim):
+        what = f"has a trajectory of shape {states.shape}, expected (T + 1, "
+        what += f"{env.state_dim}) for actions of shape {actions.shape}"
+        raise bad_file(variant.npz(seed), what)
     if is_simulated(env):
         (start,) = variant.arrays(seed, "trajectory_start")
         pictures = env.pictures(start, actions)
     else:
-        pictures = _drawn(env, states, actions, f"{variant.name}, seed {seed}")
+        pictures = (
+            draw(
+                *(env, states[: t + 1], actions[t] if t < len(actions) else None),
+                f"{variant.name}, seed {seed}, step {t}",
+            )
+            for t in range(len(states))
+        )
+    duration = 1000 // frames_per_second(env)
     for t, picture in enumerate(pictures):
-        yield picture, PAUSE if t == len(actions) else duration
-
-
-def _drawn(
-    env: Env, states: NDArray, actions: NDArray, caption: str
-) -> Iterator[NDArray[np.uint8]]:
-    """An episode's T + 1 pictures, each after the states so far."""
-    for t in range(len(states)):
-        action = actions[t] if t < len(actions) else None
-        yield draw(env, states[: t + 1], action, f"{caption}, step {t}")
-
-
-def _recorded(variant: Variant, seed: int) -> tuple[NDArray, NDArray]:
-    """The states (T + 1, d) and actions (T, …) of the seed's last greedy episode."""
-    names = ("trajectory", "trajectory_actions")
-    states, actions = variant.arrays(seed, *names)
-    if states.ndim != 2 or len(states) != len(actions) + 1:
-        shapes = f"{states.shape} and {actions.shape}"
-        raise unreadable(variant.npz(seed), f"has a trajectory of shapes {shapes}")
-    return states, actions
+        yield picture, _PAUSE if t == len(actions) else duration
 
 
 def _write(
@@ -125,12 +109,10 @@ def _write(
 ) -> Path:
     """A GIF that repeats, all frames with the palette of a middle one."""
     images = [Image.fromarray(picture) for picture in pictures]
-    palette = images[(len(images) - 1) // 2].quantize(
-        COLOURS, Image.Quantize.MAXCOVERAGE
-    )
-    first, *others = (
-        image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
-    )
+    middle = images[(len(images) - 1) // 2]
+    palette = middle.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE)
+    plain = Image.Dither.NONE
+    first, *others = (each.quantize(palette=palette, dither=plain) for each in images)
     options = {"duration": list(durations), "loop": 0, "append_images": others}
     return write_atomically(
         path, lambda handle: first.save(handle, "GIF", save_all=True, **options)

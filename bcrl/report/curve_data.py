@@ -11,34 +11,42 @@ from matplotlib.colors import to_hex, to_rgb
 from numpy.typing import NDArray
 
 from bcrl.common.divergence import diverging
-from bcrl.report import style
-from bcrl.report.curves import LINEAR, figure_methods
-from bcrl.report.figures import optimum_of
-from bcrl.report.learning import COUNTED, curve, label, metrics_of, shared_spans
-from bcrl.report.seedfiles import INDEX
+from bcrl.report.figures import style
+from bcrl.report.figures.curves import (
+    COUNTED,
+    label,
+    metrics_of,
+    optimum_of,
+    shared_spans,
+    spread_rows,
+)
+from bcrl.report.statistics import bootstrap_curves
 from bcrl.report.variants import Runs, Variant
+from bcrl.results.layout import INDEX
 
-SEEDS = 20  # whose own lines can be shown, the first of a variant's
-FIRST_SHOWN = 8  # variants that are shown at first if none has the tag
+_SEEDS = 20  # whose own lines can be shown, the first of a variant's
+_FIRST_SHOWN = 8  # variants that are shown at first if none has the tag
 #: Metrics that are shown at first, if the family has many.
-SHOWN = {"DQN": ("return", "success_rate", "greedy_return")}
-DASHES = ("7 3", "2 3", "9 3 2 3", "5 2")  # one's own algorithms, then other tags
+_SHOWN = {"DQN": ("return", "success_rate", "greedy_return")}
+_DASHES = ("7 3", "2 3", "9 3 2 3", "5 2")  # one's own algorithms, then other tags
 
 
 def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, Any]:
     """All variants of an environment and family, those of the tag shown at first."""
     found = {v.name: v for v in runs.of(env, family)}
-    main = _main(runs, env, family, tag) or dict(list(found.items())[:FIRST_SHOWN])
-    ours = {variant.name: variant for variant in main.values()}
-    others = [name for name in found if name not in ours]
-    dashes = {name: DASHES[0] for name, v in ours.items() if style.dashed(v.method)}
-    tags = list(dict.fromkeys(variant.tag for variant in ours.values()))
+    main = (
+        runs.compared(env, tag, family).values() or list(found.values())[:_FIRST_SHOWN]
+    )
+    ours = {variant.name: variant for variant in main}
+    first, *_ = tags = list(dict.fromkeys(variant.tag for variant in main))
+    dashes = {name: _DASHES[0] for name, v in ours.items() if style.dashed(v.method)}
     dashes |= {  # beside the first tag, the others need another look
-        name: DASHES[(tags.index(v.tag) - 1) % len(DASHES)]
+        name: _DASHES[(tags.index(v.tag) - 1) % len(_DASHES)]
         for name, v in ours.items()
-        if v.tag != tags[0]
+        if v.tag != first
     }
-    dashes |= dict(zip(others, itertools.cycle(DASHES[1:]), strict=False))
+    others = [name for name in found if name not in ours]
+    dashes |= dict(zip(others, itertools.cycle(_DASHES[1:]), strict=False))
     metrics = metrics_of(found)
     return {
         "id": f"{env}-{family}",
@@ -51,48 +59,36 @@ def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, 
         "target": family == "DQN",
         "metrics": metrics,
         "labels": {metric: label(family, metric) for metric in metrics},
-        "shown": [m for m in metrics if m in SHOWN.get(family, metrics)] or metrics,
+        "shown": [m for m in metrics if m in _SHOWN.get(family, metrics)] or metrics,
         "series": [
             {"on": name in ours, "dash": dashes.get(name, "")}
-            | _series(variant, metrics)
+            | _series(variant, [m for m in metrics if m in variant.metrics])
             for name, variant in (ours | found).items()
         ],
     }
 
 
-def _main(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, Variant]:
-    """The variants that the page is about."""
-    if (env, family) == (LINEAR, "DQN"):
-        return figure_methods(runs, tag)
-    return runs.tagged(env, family, tag)
-
-
 def _series(variant: Variant, metrics: list[str]) -> dict[str, Any]:
-    """A variant's curves, which all have the same points."""
-    light = style.colour(variant.method)
-    series = {
+    """A variant's curves, which all have the same points; those `far` off are cut."""
+    rows, light = spread_rows(variant), style.colour(variant.method)
+    far, curves = diverging(variant.metrics), {}
+    for metric in metrics:
+        values = variant.metrics[metric][:, rows]
+        low, high = bootstrap_curves(values)
+        q1, median, q3 = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
+        lines = {"low": low, "high": high, "median": median, "q1": q1, "q3": q3}
+        curves[metric] = {name: _numbers(line) for name, line in lines.items()}
+        curves[metric]["mean"] = _numbers(values.mean(axis=0), 7)
+        curves[metric]["seeds"] = [_numbers(seed) for seed in values[:_SEEDS]]
+        curves[metric]["far"] = metric in far
+    return {
         "name": variant.name,
         "light": light,
         "dark": _on_black(light),
-        "metrics": {},
+        "x": variant.index[rows].tolist(),
+        "task": variant.task[rows].tolist(),
+        "metrics": curves,
     }
-    for metric in metrics:
-        if metric not in variant.metrics:
-            continue
-        found = curve(variant, metric)
-        first, median, third = np.quantile(found.values, [0.25, 0.5, 0.75], axis=0)
-        series |= {"x": found.x.tolist(), "task": variant.task[found.rows].tolist()}
-        series["metrics"][metric] = {
-            "far": metric in diverging(variant.metrics),  # the axis leaves it out
-            "mean": _numbers(found.mean, 7),
-            "low": _numbers(found.low),
-            "high": _numbers(found.high),
-            "median": _numbers(median),
-            "q1": _numbers(first),
-            "q3": _numbers(third),
-            "seeds": [_numbers(values) for values in found.values[:SEEDS]],
-        }
-    return series
 
 
 def _numbers(values: NDArray[np.float64], digits: int = 4) -> list[float | None]:

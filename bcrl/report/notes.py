@@ -1,13 +1,16 @@
-"""What is odd about the runs, said by name: on the terminal and under the figures."""
+"""What is odd about the runs, by name: for the terminal and under the figures."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bcrl.results.layout import spelled, variant_name
 
 if TYPE_CHECKING:
-    from bcrl.report.variants import Variant
+    from bcrl.report.variants import Methods
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,13 @@ class Note:
     family: str | None = None
     incomplete: bool = False
 
+    @classmethod
+    def of(cls, folder: Path, text: str, footer: str = "", **more: Any) -> Note:
+        """A note on the variant in `folder`."""
+        method, _, tag = folder.name.partition("@")
+        where = {"env": folder.parent.name, "tag": tag or None, "method": method}
+        return cls(f"{folder}: {text}", footer=footer, **where, **more)
+
 
 def listed(items: Iterable[object]) -> str:
     """`a, b and c`."""
@@ -34,20 +44,7 @@ def listed(items: Iterable[object]) -> str:
     return f"{', '.join(head)} and {last}" if head else last
 
 
-def ranges(numbers: Iterable[int]) -> str:
-    """`0–4, 7` for 0, 1, 2, 3, 4, 7."""
-    runs: list[list[int]] = []
-    for number in sorted(numbers):
-        if runs and number == runs[-1][-1] + 1:
-            runs[-1].append(number)
-        else:
-            runs.append([number])
-    return ", ".join(
-        str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs
-    )
-
-
-def compared(values: Mapping[str, object]) -> str:
+def _grouped(values: Mapping[str, object]) -> str:
     """`60: FQI and C-FQI; 40: BC-FQI` for a mapping from names to values."""
     groups: dict[object, list[str]] = {}
     for name, value in values.items():
@@ -55,8 +52,8 @@ def compared(values: Mapping[str, object]) -> str:
     return "; ".join(f"{value}: {listed(names)}" for value, names in groups.items())
 
 
-def tags_shown(methods: Mapping[str, Variant]) -> str:
-    """`variants @released`, or who has the tag: `@released: BC-, SC- and SBC-DQN`."""
+def tags_shown(methods: Methods) -> str:
+    """`variants @released`, or whose: `@released: BC-, SC-, SBC-DQN`."""
     tags = {v.tag for v in methods.values()}
     (tag,) = tags - {None} or {None}
     if tag is None or len(tags) == 1:
@@ -68,7 +65,7 @@ def tags_shown(methods: Mapping[str, Variant]) -> str:
 
 
 def remarks(
-    notes: Iterable[Note], methods: Mapping[str, Variant], compares: bool = True
+    notes: Iterable[Note], methods: Methods, compares: bool = True
 ) -> list[str]:
     """The lines that belong under a figure of `methods`, which may be of several tags.
 
@@ -89,10 +86,8 @@ def remarks(
     shown = [note for note in notes if belongs(note)]
     if compares and len(tags) > 1:  # no notes were made for such a mixture yet
         shown += across_methods(methods, methods, env, None, family)
-    lines = [incomplete(shown)]
     odd = [note.footer for note in shown if note.footer and not note.incomplete]
-    if odd:
-        lines.append("Note: " + "; ".join(odd))
+    lines = [incomplete(shown), f"Note: {'; '.join(odd)}" if odd else ""]
     return [line for line in lines if line]
 
 
@@ -103,36 +98,25 @@ def incomplete(notes: Iterable[Note]) -> str:
 
 
 def across_methods(
-    methods: Mapping[str, Variant],
-    expected: Iterable[str],
-    env: str,
-    tag: str | None,
-    family: str = "FQI",
+    methods: Methods, expected: Iterable[str], env: str, tag: str | None, family: str
 ) -> list[Note]:
     """Notes on compared methods that are absent or that differ in seeds or length.
 
     In the DQN family lengths differ by design and aren't compared.
     """
-    suffix = f"@{tag}" if tag else ""
-    notes = []
-
-    def add(text: str, footer: str) -> None:
-        notes.append(Note(text, env, tag, footer, family=family))
-
-    absent = [name for name in expected if name not in methods]
+    variants = methods.values()
+    found = []  # for the terminal, for the footer
+    absent = [variant_name(name, tag) for name in expected if name not in methods]
     if absent:
-        names = listed(name + suffix for name in absent)
-        add(f"{env}: no runs of {names}", f"no runs of {names}")
-    seeds = {v.name: ranges(v.seeds) for v in methods.values()}
-    if len(set(seeds.values())) > 1:
-        text = f"{env}: seeds differ between methods ({compared(seeds)})"
-        add(text, f"seeds differ: {compared(seeds)}")
-    lengths = {v.name: len(v.stage) for v in methods.values()}
-    if family == "FQI" and len(set(lengths.values())) > 1:
-        text = f"{env}: iterations differ between methods ({compared(lengths)})"
-        add(text, f"iterations differ: {compared(lengths)}")
-    optima = {v.name: v.optimum for v in methods.values()}
-    if len({o for o in optima.values() if o is not None}) > 1:
-        text = f"{env}: optima differ between methods ({compared(optima)})"
-        add(text, "optima differ: none drawn")
-    return notes
+        found.append((f"no runs of {listed(absent)}",) * 2)
+    seeds = _grouped({v.name: spelled(v.seeds) for v in variants})
+    iterations = _grouped({v.name: len(v.stage) for v in variants})
+    for what, values in (("seeds", seeds), ("iterations", iterations)):
+        if "; " in values and (what == "seeds" or family == "FQI"):
+            text = f"{what} differ between methods ({values})"
+            found.append((text, f"{what} differ: {values}"))
+    if len({v.optimum for v in variants} - {None}) > 1:
+        optima = _grouped({v.name: v.optimum for v in variants})
+        text = f"optima differ between methods ({optima})"
+        found.append((text, "optima differ: none drawn"))
+    return [Note(f"{env}: {a}", env, tag, b, family=family) for a, b in found]

@@ -3,39 +3,36 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from bcrl.common.identity import differences, flat, identity
-from bcrl.report.document import duration
-from bcrl.report.figures import env_title
-from bcrl.report.notes import ranges
-from bcrl.report.seedfiles import command
-from bcrl.report.tables import Table, number
-from bcrl.report.variants import Runs, Variant
+from bcrl.report.tables import ABSENT, TextTable, duration, number
+from bcrl.report.variants import Runs, Variant, env_title
+from bcrl.results.layout import seed_path, spelled
+from bcrl.results.read import command_of
 
 
-def costs(runs: Runs) -> list[str | Table]:
+def costs(runs: Runs) -> list[str | TextTable]:
     """CPU time and memory of each variant, and of all of an environment's."""
-    header = ("variant", "seeds", "CPU s a seed", "CPU time", "peak memory, MiB")
     rows = []
     for env, family in runs.pairs:
         ours = runs.of(env, family)
-        spent = [variant.total("cpu_seconds") for variant in ours]
-        seeds = sum(len(variant.seeds) for variant in ours)
-        head = f"**{env_title(env)}, {family}**"
-        rows.append([head, str(seeds), "", f"**{duration(sum(spent))}**", ""])
-        for variant, seconds in zip(ours, spent, strict=True):
-            n = len(variant.seeds)
+        seeds = str(sum(len(variant.seeds) for variant in ours))
+        spent = duration(sum(variant.cpu_seconds for variant in ours))
+        rows.append([f"**{env_title(env)}, {family}**", seeds, "", f"**{spent}**", ""])
+        for variant in ours:
+            n, seconds = len(variant.seeds), variant.cpu_seconds
             peak = max(s.get("peak_memory_mib") or 0.0 for s in variant.sidecars)
             cells = [variant.name, str(n), number(seconds / n), duration(seconds)]
-            rows.append([*cells, f"{peak:.0f}" if peak else "–"])
+            rows.append([*cells, f"{peak:.0f}" if peak else ABSENT])
     text = (
         "CPU time is a seed's share of the group it trained in; memory is the largest "
         "of a process, which may have trained others before."
     )
-    return [text, Table(header, rows)]
+    header = ("variant", "seeds", "CPU s per seed", "CPU time", "peak memory, MiB")
+    return [text, TextTable(header, rows)]
 
 
 def configurations(runs: Runs) -> list[dict[str, Any]]:
@@ -43,31 +40,25 @@ def configurations(runs: Runs) -> list[dict[str, Any]]:
     groups = []
     for env, family in runs.pairs:
         reference, *_ = ours = runs.of(env, family)
-        title = f"{env_title(env)}, {family}"
         variants = [_configuration(variant, reference) for variant in ours]
-        groups.append(
-            {"title": title, "reference": reference.name, "variants": variants}
-        )
+        group = {"title": f"{env_title(env)}, {family}", "reference": reference.name}
+        groups.append(group | {"variants": variants})
     return groups
 
 
 def _configuration(variant: Variant, reference: Variant) -> dict[str, Any]:
     """One variant's settings as lines: key, value, the reference's if it differs."""
     config, other = (v.sidecars[0]["config"] for v in (variant, reference))
-    differing = differences(config, other)
-    lines = [
-        (key, _text(value), _text(differing[key][1]) if key in differing else None)
-        for key, value in flat(identity(config)).items()
-    ]
-    absent = [k for k in differing if k not in flat(identity(config))]
-    lines += [(key, "absent", _text(differing[key][1])) for key in absent]
-    commands = dict.fromkeys(command(sidecar) for sidecar in variant.sidecars)
+    differing = {k: _text(b) for k, (_, b) in differences(config, other).items()}
+    values = {key: _text(value) for key, value in flat(identity(config)).items()}
+    values |= {key: "absent" for key in differing if key not in values}
+    commands = dict.fromkeys(map(command_of, variant.sidecars))
     differ = f", {len(differing)} differ" if differing else ""
     return {
         "name": variant.name,
-        "summary": f"{len(lines)} settings{differ}",
+        "summary": f"{len(values)} settings{differ}",
         "command": "\n".join(filter(None, commands)),
-        "lines": lines,
+        "lines": [(key, value, differing.get(key)) for key, value in values.items()],
     }
 
 
@@ -75,45 +66,38 @@ def _text(value: object) -> str:
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
-def provenance(runs: Runs) -> list[str | Table]:
+def seed_origins(runs: Runs) -> list[str | TextTable]:
     """Which code, libraries and machine made which seeds, and when."""
-    made: dict[tuple[str, ...], list[tuple[Variant, int]]] = {}
+    made: dict[tuple[str, ...], dict[Path, list[int]]] = {}
+    rows = []
     for variant in runs.variants:
         for seed, sidecar in zip(variant.seeds, variant.sidecars, strict=True):
-            made.setdefault(_origin(sidecar), []).append((variant, seed))
-    rows = []
-    for origin, seeds in made.items():
-        when = [_written(variant, seed) for variant, seed in seeds]
-        rows.append([_who(seeds), *origin, f"{min(when)} – {max(when)} UTC"])
+            group = made.setdefault(_origin(sidecar), {})
+            group.setdefault(variant.folder, []).append(seed)
+    for origin, group in made.items():
+        who = [f"{v.parent.name} {v.name} {spelled(s)}" for v, s in group.items()]
+        when = [_written(folder, seed) for folder, s in group.items() for seed in s]
+        rows.append([", ".join(who), *origin, f"{min(when)} – {max(when)} UTC"])
     header = ("seeds", "revision", "versions", "machine", "finished (files' dates)")
-    return [Table(header, rows)]
+    return [TextTable(header, rows)]
 
 
 def _origin(sidecar: dict[str, Any]) -> tuple[str, ...]:
     """Revision, versions and machine as text; a dash for what isn't recorded."""
-    git, machine = sidecar.get("git") or {}, sidecar.get("machine") or {}
-    revision = str(git.get("revision") or "–")[:10]
+    git, machine = sidecar.get("git") or {}, dict(sidecar.get("machine") or {})
+    revision = str(git.get("revision") or ABSENT)[:10]
     changed = " with changes" if git.get("dirty") else ""
     versions = (sidecar.get("versions") or {}).items()
-    where = [str(v) for k, v in machine.items() if k != "cores" and v]
-    cores = [f"{machine['cores']} cores"] if machine.get("cores") else []
-    device = [str(sidecar["device"])] if sidecar.get("device") else []
+    cores = machine.pop("cores", None)
+    where = [*machine.values(), cores and f"{cores} cores", sidecar.get("device")]
     return (
         f"`{revision}`{changed}",
-        ", ".join(f"{name} {version}" for name, version in versions) or "–",
-        " · ".join([*where, *cores, *device]) or "–",
+        ", ".join(f"{name} {version}" for name, version in versions) or ABSENT,
+        " · ".join(map(str, filter(None, where))) or ABSENT,
     )
 
 
-def _who(seeds: Iterable[tuple[Variant, int]]) -> str:
-    """`maze BC-FQI 0–2, …`."""
-    found: dict[str, list[int]] = {}
-    for variant, seed in seeds:
-        found.setdefault(f"{variant.env} {variant.name}", []).append(seed)
-    return ", ".join(f"{name} {ranges(numbers)}" for name, numbers in found.items())
-
-
-def _written(variant: Variant, seed: int) -> str:
+def _written(folder: Path, seed: int) -> str:
     """When a seed's JSON was written, which is last, as far as the file knows."""
-    stamp = variant.folder.joinpath(f"seed_{seed:04d}.json").stat().st_mtime
+    stamp = seed_path(folder, seed, "json").stat().st_mtime
     return f"{datetime.fromtimestamp(stamp, UTC):%Y-%m-%d %H:%M}"

@@ -1,77 +1,22 @@
-"""Aggregates over seeds: the long-form CSV and the tables at the end of training."""
+"""Tables of text, cells with intervals, and the long-form aggregate over seeds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bcrl.report.seedfiles import INDEX
-from bcrl.report.statistics import (
-    Interval,
-    bootstrap,
-    interquartile_mean,
-    mean,
-    share_interval,
-    standard_error,
-)
-from bcrl.report.variants import Runs, Variant
+from bcrl.report.statistics import Interval, bootstrap, standard_error
+from bcrl.report.variants import Methods, Runs, Variant
+from bcrl.results.layout import INDEX
 
-_SUMMARY = ("metric", "seeds", "mean", "standard_error")
-AGGREGATE_COLUMNS = {
-    family: ("scale", "env", "variant", *index, *_SUMMARY)
-    for family, index in INDEX.items()
-}
+ABSENT = "–"  # a cell without a value
 
 
-def aggregate(runs: Runs, family: str = "FQI") -> pd.DataFrame:
-    """Mean and standard error over seeds of every metric at every evaluation.
-
-    One row per (variant, iteration or step, metric), tagged variants included; columns
-    AGGREGATE_COLUMNS[family]. A mean over a non-finite value is empty, as is the
-    standard error (ddof = 1) of a single seed.
-    """
-    columns = AGGREGATE_COLUMNS[family]
-    *_, counter = INDEX[family]
-    blocks = []
-    for variant in runs.variants:
-        if variant.family != family:
-            continue
-        for metric, values in variant.metrics.items():
-            block = {
-                "scale": runs.scale,
-                "env": variant.env,
-                "variant": variant.name,
-                "stage": variant.stage,
-                "task": variant.task,
-                counter: variant.index,
-                "metric": metric,
-                "seeds": len(variant.seeds),
-                "mean": mean(values),
-                "standard_error": standard_error(values, ddof=1),
-            }
-            blocks.append(pd.DataFrame(block, columns=columns))
-    return pd.concat(blocks, ignore_index=True)
-
-
-def number(value: float) -> str:
-    """Four significant digits, a real minus sign, a dash for nan."""
-    if not np.isfinite(value):
-        return "–"
-    return f"{value:#.4g}".rstrip(".").replace("-", "−")
-
-
-def estimate(value: float, interval: Interval) -> str:
-    """`0.12 [0.10, 0.14]`, without the brackets if there is no interval."""
-    if not np.isfinite(interval).all():
-        return number(value)
-    return f"{number(value)} [{number(interval.low)}, {number(interval.high)}]"
-
-
-class Table(NamedTuple):
+class TextTable(NamedTuple):
     """Cells of text; as a string it is Markdown, with bars inside cells escaped."""
 
     header: Sequence[str]
@@ -89,56 +34,76 @@ class Section(NamedTuple):
     """Paragraphs and tables below a title; as a string it is Markdown."""
 
     title: str
-    parts: Sequence[str | Table]
+    parts: Sequence[str | TextTable]
 
     def __str__(self) -> str:
         return "\n".join([f"## {self.title}\n", *map(str, self.parts)])
 
 
-def mean_cell(values: NDArray[np.float64]) -> str:
-    """Mean of (S,) values over seeds with its interval."""
+def by_method(
+    methods: Methods, columns: Mapping[str, Callable[[Variant], str]]
+) -> TextTable:
+    """One row per method: its variant's name, then the cell of every column."""
+    rows = [[v.name, *(cell(v) for cell in columns.values())] for v in methods.values()]
+    return TextTable(["method", *columns], rows)
+
+
+def number(value: float) -> str:
+    """Four significant digits, a real minus sign, a dash for nan."""
+    if not np.isfinite(value):
+        return ABSENT
+    return f"{value:#.4g}".rstrip(".").replace("-", "−")
+
+
+def estimate(value: float, interval: Interval) -> str:
+    """`0.12 [0.10, 0.14]`, without the brackets if there is no interval."""
+    if not np.isfinite(interval).all():
+        return number(value)
+    return f"{number(value)} [{number(interval.low)}, {number(interval.high)}]"
+
+
+def mean_cell(values: NDArray[np.float64] | None) -> str:
+    """Mean of (S,) values over seeds with its interval; a dash if there are none."""
+    if values is None:
+        return ABSENT
     return estimate(float(values.mean()), bootstrap(values))
 
 
-def _share_cell(values: NDArray[np.float64]) -> str:
-    hits = int((values > 0).sum())
-    return f"{hits}/{len(values)} {_bracket(share_interval(hits, len(values)))}"
+def duration(seconds: float) -> str:
+    """`1.5 h`, `12 s`."""
+    return f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
 
 
-def _bracket(interval: Interval) -> str:
-    return f"[{number(interval.low)}, {number(interval.high)}]"
+def seeds_cell(variant: Variant) -> str:
+    """`100`, or `97 (3 failed)` if some diverged."""
+    failed = f" ({len(variant.failed)} failed)" if variant.failed else ""
+    return f"{len(variant.seeds)}{failed}"
 
 
-def final_table(methods: Mapping[str, Variant]) -> Table:
-    """Every metric after the last iteration: mean with interval, interquartile mean."""
-    metrics = [m for m in ("q_error", "q_error_start", "return") if _all(methods, m)]
-    header = ["method", "seeds", *metrics, *(f"{m}, IQM" for m in metrics)]
-    solved = _all(methods, "solved")
-    rows = []
-    for name, variant in methods.items():
-        last = {m: variant.metrics[m][:, -1] for m in metrics}
-        row = [name, str(len(variant.seeds)), *map(mean_cell, last.values())]
-        row += [number(interquartile_mean(values)) for values in last.values()]
-        if solved:
-            row.append(_share_cell(variant.metrics["solved"][:, -1]))
-        rows.append(row)
-    return Table([*header, "seeds solving the target"] if solved else header, rows)
+def aggregate(runs: Runs, family: str = "FQI") -> pd.DataFrame:
+    """Mean and standard error over seeds of every metric at every evaluation.
 
-
-def stage_table(methods: Mapping[str, Variant], metric: str) -> Table:
-    """The mean of `metric` over seeds at the end of every stage, with its task."""
-    longest = max(methods.values(), key=lambda v: len(v.stage))
-    stages = np.unique(longest.stage)
-    rows = []
-    for name, variant in methods.items():
-        row = [name]
-        for stage in stages:
-            at = np.flatnonzero(variant.stage == stage)
-            values = variant.metrics[metric][:, at[-1]] if len(at) else None
-            row.append("–" if values is None else number(float(values.mean())))
-        rows.append(row)
-    return Table(["method", *(f"stage {stage}" for stage in stages)], rows)
-
-
-def _all(methods: Mapping[str, Variant], metric: str) -> bool:
-    return all(metric in variant.metrics for variant in methods.values())
+    One row per (variant, iteration or step, metric), tagged variants included. A mean
+    over a non-finite value is empty, as is the standard error (ddof = 1) of one seed.
+    """
+    *_, counter = INDEX[family]
+    blocks = [
+        pd.DataFrame(
+            {
+                "scale": runs.scale,
+                "env": variant.env,
+                "variant": variant.name,
+                "stage": variant.stage,
+                "task": variant.task,
+                counter: variant.index,
+                "metric": metric,
+                "seeds": len(variant.seeds),
+                "mean": values.mean(axis=0),
+                "standard_error": standard_error(values, ddof=1),
+            }
+        )
+        for variant in runs.variants
+        if variant.family == family
+        for metric, values in variant.metrics.items()
+    ]
+    return pd.concat(blocks, ignore_index=True)

@@ -1,7 +1,8 @@
-"""What is read: a variant's seeds as arrays, and one scale's variants."""
+"""What is reported on: a variant's seeds as arrays, and the variants of a scale."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.common.files import seed_path
 from bcrl.report.notes import Note
-from bcrl.report.seedfiles import read_arrays
+from bcrl.results.layout import seed_path
+from bcrl.results.read import read_arrays
 
 #: The methods of each family, in the order of the legends.
 METHODS = ("FQI", "C-FQI", "B-FQI", "BC-FQI")
@@ -20,6 +21,17 @@ DQN_METHODS = (
     *("RPL", "PPR"),
 )
 FAMILIES = {"FQI": METHODS, "DQN": DQN_METHODS}
+#: The methods that the paper's figures compare: what is absent of them gets a note.
+COMPARED = {
+    ("car_on_hill", "FQI"): METHODS,
+    ("maze", "FQI"): METHODS,
+    ("linear_system", "DQN"): tuple(
+        name for name in DQN_METHODS if name not in ("B-DQN", "S-DQN", "SB-DQN")
+    ),
+}
+_TITLES = {"car_on_hill": "Car on the hill"}
+
+Methods = Mapping[str, "Variant"]  # by the name of the method
 
 
 @dataclass(frozen=True)
@@ -32,11 +44,8 @@ class Variant:
     `seeds`; `failed` are the seeds that diverged and are left out.
     """
 
-    env: str
-    method: str
-    tag: str | None
-    family: str
     folder: Path
+    family: str
     seeds: tuple[int, ...]
     stage: NDArray[np.int64]
     task: NDArray[np.int64]
@@ -46,9 +55,24 @@ class Variant:
     failed: tuple[int, ...] = ()
 
     @property
+    def env(self) -> str:
+        """The environment's name."""
+        return self.folder.parent.name
+
+    @property
     def name(self) -> str:
         """The folder's name, `BC-FQI` or `BC-FQI@released`."""
         return self.folder.name
+
+    @property
+    def method(self) -> str:
+        """The name without the tag."""
+        return self.name.partition("@")[0]
+
+    @property
+    def tag(self) -> str | None:
+        """What follows the @ in the name."""
+        return self.name.partition("@")[2] or None
 
     @property
     def optimum(self) -> float | None:
@@ -57,9 +81,18 @@ class Variant:
         (value,) = values if len(values) == 1 else (None,)
         return None if value is None else float(value)
 
-    def total(self, fact: str) -> float:
-        """The sum over seeds of a number in their JSON documents."""
-        return sum(float(sidecar.get(fact) or 0.0) for sidecar in self.sidecars)
+    @property
+    def cpu_seconds(self) -> float:
+        """CPU time of all seeds."""
+        return sum(float(s.get("cpu_seconds") or 0.0) for s in self.sidecars)
+
+    def last(self, metric: str) -> NDArray[np.float64]:
+        """A metric at the last evaluation, (S,)."""
+        return self.metrics[metric][:, -1]
+
+    def rows(self, stage: int) -> NDArray[np.intp]:
+        """The rows of a stage; none if there is no such stage."""
+        return np.flatnonzero(self.stage == stage)
 
     def arrays(self, seed: int, *names: str) -> list[NDArray[np.float64]]:
         """The named arrays of a seed's NPZ; BcrlError if it does not hold them."""
@@ -100,14 +133,23 @@ class Runs:
         return {v.method: v for v in self.of(env, family) if v.tag == tag}
 
     def methods(
-        self, env: str, tag: str | None, family: str = "FQI", fall_back: bool = False
+        self, env: str, tag: str | None, family: str = "FQI"
     ) -> dict[str, Variant]:
-        """A family's methods that are there for `env`, in the legends' order.
-
-        `fall_back`: a method without a run of that tag is represented by its untagged
-        one, provided that some method has the tag.
-        """
+        """The known methods of a tag. In the DQN family an untagged one stands in for
+        a method that has no run of a tag which others have."""
         found = self.tagged(env, family, tag)
-        if fall_back and found:
+        if found and family == "DQN":
             found = self.tagged(env, family, None) | found
         return {name: found[name] for name in FAMILIES[family] if name in found}
+
+    def compared(self, env: str, tag: str | None, family: str) -> dict[str, Variant]:
+        """Those of them that the paper's figures compare; in other environments all."""
+        if (env, family) not in COMPARED:
+            return self.tagged(env, family, tag)
+        found = self.methods(env, tag, family)
+        return {n: v for n, v in found.items() if n in COMPARED[env, family]}
+
+
+def env_title(env: str) -> str:
+    """An environment's name as a title, `Mountain car`."""
+    return _TITLES.get(env, env.replace("_", " ").capitalize())

@@ -1,1 +1,1 @@
-"""A seed's result files: one definition for writer and reader."""
+"""Results on disk: their layout, reading and checking them, and live logging."""

@@ -14,10 +14,10 @@ import numpy as np
 from bcrl.common import plugins
 from bcrl.common.checks import construct, one_of
 from bcrl.errors import ConfigError
+from bcrl.results.layout import LOGS, seed_name
 
 #: Takes the name of the column that counts, and each seed's new rows.
 Log = Callable[[str, Sequence[Sequence[Mapping[str, float]]]], None]
-FOLDER = ".tensorboard"  # in runs_dir; hidden, so that nobody takes it for results
 
 
 class Writer(Protocol):
@@ -39,7 +39,7 @@ class Logger(Protocol):
     def open(self, runs_dir: Path, run: str) -> Writer:
         """A writer for `run`, such as "quick/maze/BC-FQI/seed_0007".
 
-        A run that goes on after an interruption writes all its rows again.
+        A run that resumes after an interruption writes all its rows again.
         """
 
 
@@ -57,7 +57,7 @@ class Nothing:
 
 @dataclass(frozen=True)
 class TensorBoard:
-    """Event files in `<runs_dir>/.tensorboard`, a folder a seed."""
+    """Event files in `<runs_dir>/.tensorboard`, one folder per seed."""
 
     def __post_init__(self) -> None:
         if importlib.util.find_spec("tensorboard") is None:
@@ -65,7 +65,7 @@ class TensorBoard:
             raise ConfigError("logger", "tensorboard", why)
 
     def open(self, runs_dir: Path, run: str) -> Writer:
-        return _Events(runs_dir / FOLDER / run)
+        return _Events(runs_dir / LOGS / run)
 
 
 class _Events:
@@ -76,21 +76,19 @@ class _Events:
 
         # Whatever an interrupted process has logged gives way to what comes.
         self._events = SummaryWriter(folder, purge_step=0)
+        self.close = self._events.close
 
     def write(self, count: int, row: Mapping[str, float]) -> None:
         for name, value in row.items():
             if np.isfinite(value):
                 self._events.add_scalar(name, value, count)
 
-    def close(self) -> None:
-        self._events.close()
-
 
 LOGGERS: dict[str, type] = {"none": Nothing, "tensorboard": TensorBoard}
 
 
 def logger(section: Any) -> Logger:
-    """What the section `logger` of a config asks for; ConfigError if it can't be.
+    """The logger of a config's section `logger`; ConfigError if there is none such.
 
     Besides LOGGERS a class of the user's own may be named, as BCRL_TRUST allows.
     """
@@ -108,19 +106,18 @@ def logger(section: Any) -> Logger:
 def opened(
     config: Mapping[str, Any], directory: Path, seeds: Sequence[int]
 ) -> Iterator[Log]:
-    """What takes new rows of the run in `directory`, a list for each seed."""
+    """A function that takes new rows of the run in `directory`, a list per seed."""
     made, root = logger(config["logger"]), Path(config["runs_dir"])
     folder = directory.relative_to(root).as_posix()
-    writers: list[Writer] = []
-
-    def log(index: str, rows: Sequence[Sequence[Mapping[str, float]]]) -> None:
-        for writer, added in zip(writers, rows, strict=True):
-            for row in added:
-                rest = {key: value for key, value in row.items() if key != index}
-                writer.write(int(row[index]), rest)
-
     with ExitStack() as stack:
-        for seed in seeds:
-            writers.append(made.open(root, f"{folder}/seed_{seed:04d}"))
-            stack.callback(writers[-1].close)
+        writers = [made.open(root, f"{folder}/{seed_name(seed)}") for seed in seeds]
+        for writer in writers:
+            stack.callback(writer.close)
+
+        def log(index: str, rows: Sequence[Sequence[Mapping[str, float]]]) -> None:
+            for writer, added in zip(writers, rows, strict=True):
+                for row in added:
+                    rest = {key: value for key, value in row.items() if key != index}
+                    writer.write(int(row[index]), rest)
+
         yield log

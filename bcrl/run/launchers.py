@@ -1,8 +1,8 @@
-"""Hydra's launchers for processes and for Slurm, made fit for jobs that can go on.
+"""Hydra's launcher for Slurm, with jobs that resume.
 
-They go by the names and keys of the plugins' own. Besides, a variant's seeds are split
-into jobs, what is complete isn't launched, a signal ends in checkpoints, and Slurm puts
-back what had to leave. What has become of the seeds is read from their files, not here.
+It has the name and the keys of submitit's plugin. In addition it splits a variant's
+seeds into jobs, leaves out complete seeds, writes checkpoints after a signal, and has
+Slurm requeue preempted jobs. The results are read from the seeds' files afterwards.
 """
 
 from __future__ import annotations
@@ -14,187 +14,151 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from concurrent.futures import BrokenExecutor
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
-from multiprocessing import active_children
 from typing import Any, NoReturn
 
 from hydra.core.plugins import Plugins
 from hydra.core.singleton import Singleton
-from hydra_plugins.hydra_joblib_launcher.joblib_launcher import JoblibLauncher
 from hydra_plugins.hydra_submitit_launcher.submitit_launcher import SlurmLauncher
-from omegaconf import DictConfig
 
 from bcrl.common.signals import EXIT_CODE, Interrupted, Stop
 from bcrl.common.terminal import say
-from bcrl.config import guard, vetting
-from bcrl.config import plan as compose
+from bcrl.config import jobs as planning
+from bcrl.config.plan import part
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.run import records
-from bcrl.run.workers import cores
 
-COMMANDS = ("sbatch", "srun", "squeue")  # of Slurm's, that have to be here
-PATIENCE = 1800.0  # seconds that squeue may fail, as while Slurm restarts
-ARRAY = 1000  # jobs of one array: Slurm's MaxArraySize is 1001 unless a site says more
-Jobs = Sequence[Sequence[str]]  # each one's overrides
+_COMMANDS = ("sbatch", "srun", "squeue")  # of Slurm's, that must exist here
+_PATIENCE = 1800.0  # seconds that squeue may fail, as while Slurm restarts
+_ARRAY = 1000  # jobs per array: Slurm's MaxArraySize is 1001 unless a site changed it
 
 
 class Unattended(BcrlError):
-    """Slurm has jobs of this command, which ends before them."""
+    """The command ends while Slurm still has jobs of it."""
 
     exit_code = 3
 
 
-class Local(JoblibLauncher):
-    """Jobs in processes of this machine, so that jobs × workers × threads = cores."""
-
-    def __init__(
-        self, n_jobs: int | None = None, seeds_per_job: int | None = None, **rest: Any
-    ) -> None:
-        super().__init__(n_jobs=_count("n_jobs", n_jobs), **rest)
-        self.seeds_per_job = _count("seeds_per_job", seeds_per_job)
-
-    def launch(self, job_overrides: Jobs, initial_job_idx: int) -> Sequence:
-        jobs = _divided(self, job_overrides, self.seeds_per_job)
-        if not jobs:
-            return []
-        each = max(1, cores() // self.config.workers)
-        at_once = min(self.joblib["n_jobs"] or each, len(jobs))
-        self.joblib["n_jobs"] = at_once
-        if self.config.threads is None:
-            jobs = [[*job, f"threads={max(1, each // at_once)}"] for job in jobs]
-        self.task_function = partial(_unless_stopped, self.task_function)
-        stop = _PassedOn()
-        with stop.on_signals(second_ends_all=True), guard.unregistered():
-            try:
-                return super().launch(jobs, initial_job_idx)
-            except BrokenExecutor as error:
-                if not stop.asked:
-                    say(f"bcrl: a process died, all jobs have ended: {error}")
-                return []
-            finally:
-                if stop.asked:
-                    raise Interrupted
-
-
-class _PassedOn(Stop):
-    """A wish to stop that this process's children are told of."""
-
-    def ask(self) -> None:
-        super().ask()
-        for process in active_children():
-            process.terminate()
-
-
-_stop = Stop()  # of a process that joblib gives one job after the other
-
-
-def _unless_stopped(job: Callable[[DictConfig], None], config: DictConfig) -> None:
-    """Do a job; a process that was told to stop saves, and begins no other.
-
-    An exception would have joblib kill the other processes while they save.
-    """
-    if not _stop.asked:
-        _stop.on_signals(second_ends_all=False).__enter__()  # also between jobs
-        try:
-            job(config)
-        except Interrupted:
-            _stop.ask()
-
-
 class Slurm(SlurmLauncher):
-    """Jobs as Slurm's arrays; one that has to leave saves, and is put back."""
+    """Jobs as Slurm's arrays; a preempted job saves and is requeued."""
 
     def __init__(self, seeds_per_job: int | None = None, **params: Any) -> None:
         super().__init__(**params)
-        self.seeds_per_job = _count("seeds_per_job", seeds_per_job)
+        self.seeds_per_job = seeds_per_job
         self.argv = sys.argv
 
-    def launch(self, job_overrides: Jobs, initial_job_idx: int) -> Sequence:
-        import submitit  # late, as the plugin does: a second
-
-        if missing := [name for name in COMMANDS if not shutil.which(name)]:
+    def launch(
+        self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
+    ) -> Sequence:
+        """Submit the jobs that are not complete and wait until the last one ends."""
+        if missing := [name for name in _COMMANDS if not shutil.which(name)]:
             why = f"there is no {', '.join(missing)} here: run it on a login node"
             raise ConfigError("hydra/launcher", "slurm", why)
-        jobs = _divided(self, job_overrides, self.seeds_per_job)
+        jobs = self._divided(job_overrides)
+        folder = self.params["submitit_folder"]
+        executor = self._executor(folder)
+        state = Singleton.get_state()
+        rows = [(job, "hydra.sweep.dir", n, "", state) for n, job in enumerate(jobs)]
+        arrays: list[str] = []
+        stop = Stop()
+        with stop.on_signals():
+            for first in range(0, len(rows), _ARRAY):
+                some = rows[first : first + _ARRAY]
+                try:
+                    submitted = executor.map_array(self, *zip(*some, strict=True))
+                except (RuntimeError, OSError) as error:
+                    if stop.requested:  # Ctrl-C also ends a hanging sbatch
+                        break
+                    raise _rejected(error, arrays, first, len(rows)) from error
+                arrays.append(submitted[0].job_id.partition("_")[0])
+                count = f"{len(some)} job{'s' * (len(some) > 1)}"
+                say(f"Slurm: {count} as {arrays[-1]}; logs in {folder}")
+                if stop.requested:
+                    break
+            if arrays or stop.requested:
+                _wait(arrays, self.config.progress != "none", stop)
+        return []
+
+    def _executor(self, folder: str) -> Any:
+        """Submitit's executor with the parameters of the YAML."""
+        import submitit  # takes a second
+
         params = {f"slurm_{key}": value for key, value in self.params.items()}
-        folder = params.pop("slurm_submitit_folder")
+        del params["slurm_submitit_folder"]
         timeouts = params.pop("slurm_max_num_timeout")
         executor = submitit.AutoExecutor(
             folder, "slurm", slurm_max_num_timeout=timeouts
         )
-        # Since Slurm 22.05 a step has one core unless it says how many.
+        # Since Slurm 22.05 each step has one core unless it asks for more.
         srun = [f"--cpus-per-task={self.params['cpus_per_task']}"]
         more = {"requeue": True}  # also after a node's failure
         params |= {"slurm_srun_args": srun, "slurm_additional_parameters": more}
         executor.update_parameters(**params)
-        with guard.unregistered():
-            state = Singleton.get_state()
-        rows = [(job, "hydra.sweep.dir", n, "", state) for n, job in enumerate(jobs)]
-        arrays: list[str] = []
-        stop = Stop()
-        with stop.on_signals(second_ends_all=True):
-            for first in range(0, len(rows), ARRAY):
-                some = rows[first : first + ARRAY]
-                try:
-                    submitted = executor.map_array(self, *zip(*some, strict=True))
-                except (RuntimeError, OSError) as error:
-                    if stop.asked:  # Ctrl-C ends a hanging sbatch, too
-                        break
-                    raise _refused(error, arrays, first, len(rows)) from error
-                arrays.append(submitted[0].job_id.partition("_")[0])
-                count = f"{len(some)} job{'s' * (len(some) > 1)}"
-                say(f"Slurm: {count} as {arrays[-1]}; logs in {folder}")
-                if stop.asked:
-                    break
-            if arrays or stop.asked:
-                _wait(arrays, self.config.progress != "none", stop)
-        return []
+        return executor
+
+    def _divided(self, jobs: Sequence[Sequence[str]]) -> list[list[str]]:
+        """Each job's overrides, once per part of its seeds that isn't complete."""
+        load = self.hydra_context.config_loader.load_sweep_config
+        size, divided = self.seeds_per_job, []
+        for overrides in map(list, jobs):
+            config = load(self.config, overrides)
+            plan = planning.plan_of_job(config, config.hydra)
+            parts: list[str | None] = [None]
+            if size and config.seeds.part is None:
+                number = -(-len(plan.seeds) // size)
+                parts = [f"{k}/{number}" for k in range(1, number + 1)]
+            for which in parts:
+                seeds = part(plan.seeds, which)
+                if records.pending(replace(plan, seeds=seeds)):
+                    added = [f"seeds.part={which}"] if which else []
+                    divided.append([*overrides, *added])
+        return divided
 
     def __call__(self, *arguments: Any) -> NoReturn:
+        """Run one job in a process of Slurm's."""
         import submitit
 
-        sys.argv = self.argv  # a result says which command it comes from
+        sys.argv = self.argv  # results name the command that submitted them
         try:
             code = super().__call__(*arguments).return_value
         except Interrupted:
             own = f"--jobs={os.environ['SLURM_JOB_ID']}"
-            now, _ = _squeue(own, "--format=%T %r")
-            now = now or ""
-            # Not where somebody has ended it, or Slurm puts it back by itself.
+            now = _squeue(own, "--format=%T %r")[0] or ""
+            # Neither after scancel nor where Slurm requeues the job by itself.
             if now.startswith("RUNNING") or now.endswith("TimeLimit"):
                 usual = f"SIG{submitit.JobEnvironment.USR_SIG}"
-                signal.raise_signal(signal.Signals[usual])  # submitit puts it back
+                signal.raise_signal(signal.Signals[usual])  # submitit requeues it
             code = EXIT_CODE
         sys.exit(code)  # nobody waits for a result
 
 
-def _refused(error: Exception, arrays: Sequence[str], taken: int, n: int) -> BcrlError:
-    """What to say if sbatch fails, perhaps after some arrays were submitted."""
+def _rejected(error: Exception, arrays: Sequence[str], taken: int, n: int) -> BcrlError:
+    """The error to raise if sbatch fails, perhaps after it took some arrays."""
     words = " ".join(str(error).split())
     if not arrays:
-        return BcrlError(f"Slurm refuses the jobs, none was submitted: {words}")
+        return BcrlError(f"Slurm rejects the jobs, none was submitted: {words}")
+    names = " ".join(arrays)
     return Unattended(
-        f"Slurm took {taken} of {n} jobs, as {' '.join(arrays)}, and refuses the rest: "
-        f"{words}\n`scancel {' '.join(arrays)}` ends them; once they are over, the "
-        "same command submits what isn't complete then"
+        f"Slurm took {taken} of {n} jobs, as {names}, and rejects the rest: {words}\n"
+        f"`scancel {names}` ends them; once they are over, run the same command again "
+        "to submit the incomplete rest"
     )
 
 
 def _wait(arrays: Sequence[str], telling: bool, stop: Stop) -> None:
-    """Until none of the arrays has a job waiting or running; a signal interrupts."""
+    """Wait until no array has a job waiting or running; a signal interrupts."""
     pause, before, answered = 1.0, "", time.monotonic()
-    while not stop.asked:
+    names = " ".join(arrays)
+    while not stop.requested:
         listed, why = _squeue("--me", "--array", "--format=%F %T")
         if listed is None:
             if before != why:
-                say(f"Slurm: squeue fails, it is asked again: {why}")
+                say(f"Slurm: squeue fails, trying again: {why}")
             pause, before = min(30.0, 1.2 * pause), why
-            if time.monotonic() > answered + PATIENCE:
-                text = f"squeue has failed for {PATIENCE / 60:.0f} minutes: {why}"
-                more = f"what it had of {' '.join(arrays)} may run on (--status tells)"
+            if time.monotonic() > answered + _PATIENCE:
+                text = f"squeue has failed for {_PATIENCE / 60:.0f} minutes: {why}"
+                more = f"the jobs of {names} may still run (--status shows it)"
                 raise Unattended(f"{text}; {more}")
         else:
             answered = time.monotonic()
@@ -209,17 +173,16 @@ def _wait(arrays: Sequence[str], telling: bool, stop: Stop) -> None:
             before = now
         time.sleep(pause)
     if arrays:
-        say(f"bcrl: Slurm goes on with it; `scancel {' '.join(arrays)}` ends it")
+        say(f"bcrl: Slurm continues with the jobs; `scancel {names}` ends them")
     raise Interrupted
 
 
 def _squeue(*options: str) -> tuple[str | None, str]:
-    """What Slurm's queue says, or None and why it doesn't, as while Slurm restarts."""
-    command = ["squeue", "--noheader", *options]
+    """Slurm's queue, or None and why squeue fails, as while Slurm restarts."""
+    command: Any = ["squeue", "--noheader", *options]
+    decoding: Any = {"encoding": "utf-8", "errors": "replace"}
     try:
-        done = subprocess.run(
-            command, capture_output=True, encoding="utf-8", errors="replace", timeout=60
-        )
+        done = subprocess.run(command, capture_output=True, timeout=60, **decoding)
     except (OSError, subprocess.TimeoutExpired) as error:
         return None, str(error)
     if done.returncode:
@@ -227,35 +190,7 @@ def _squeue(*options: str) -> tuple[str | None, str]:
     return done.stdout.strip(), ""
 
 
-def _count(key: str, value: object) -> int | None:
-    """A number of at least 1, or None; ConfigError for anything else."""
-    if value is None or (type(value) is int and value >= 1):
-        return value
-    why = "must be a number of at least 1, or null"
-    raise ConfigError(f"hydra.launcher.{key}", value, why)
-
-
-def _divided(launcher: Local | Slurm, jobs: Jobs, size: int | None) -> list[list[str]]:
-    """Each job's overrides, once for each part of its seeds that isn't complete."""
-    load = launcher.hydra_context.config_loader.load_sweep_config
-    divided = []
-    for overrides in map(list, jobs):
-        config = load(launcher.config, overrides)
-        plan = vetting.job(config, config.hydra)
-        parts: list[str | None] = [None]
-        if size and config.seeds.part is None:
-            number = -(-len(plan.seeds) // size)
-            parts = [f"{k}/{number}" for k in range(1, number + 1)]
-        for part in parts:
-            seeds = compose.part(plan.seeds, part)
-            if records.pending(replace(plan, seeds=seeds)):
-                divided.append([*overrides, *([f"seeds.part={part}"] if part else [])])
-    return divided
-
-
-def register() -> None:
-    """Have Hydra make these launchers where the plugins' are asked for."""
-    known = Plugins.instance().class_name_to_class
-    for own in (Local, Slurm):
-        usual = own.__bases__[0]
-        known[f"{usual.__module__}.{usual.__name__}"] = own
+def register_slurm() -> None:
+    """Have Hydra make this launcher where the plugin's is named."""
+    usual = f"{SlurmLauncher.__module__}.{SlurmLauncher.__name__}"
+    Plugins.instance().class_name_to_class[usual] = Slurm

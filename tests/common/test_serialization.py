@@ -22,7 +22,7 @@ def there_and_back(tmp_path, content, given=()):
     with open(path, "wb") as file:
         serialization.write(file, {"of": "a test"}, content, given)
     assert serialization.read_about(path) == {"of": "a test"}
-    return serialization.read(path, given)
+    return serialization.read_content(path, given)
 
 
 def test_values_come_back_with_their_types(tmp_path):
@@ -137,4 +137,4 @@ def test_a_forged_structure_is_refused(tmp_path, structure):
     path = tmp_path / "forged.npz"
     forged(path, structure, bytes(8))
     with pytest.raises(BcrlError, match=r"forged.npz can't be read"):
-        serialization.read(path, [])
+        serialization.read_content(path, [])

@@ -1,9 +1,6 @@
 """Environments as people plug them in, each one odd in one way."""
 
-from __future__ import annotations
-
 import collections
-import fractions
 import os
 import sys
 import tempfile
@@ -21,30 +18,33 @@ from gymnasium.spaces import (
     Tuple,
 )
 
-FREE = Box(-np.inf, np.inf, (1,), np.float64)
+
+def box(*shape, low=-np.inf, high=np.inf, dtype=np.float64):
+    return Box(low, high, shape, dtype)
 
 
 class Walk(gymnasium.Env):
     """A well-behaved walk on a ring of 7 cells; cell 0 ends it and pays 1."""
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
-    observation_space, action_space = FREE, Discrete(2)
+    observation_space, action_space = box(1), Discrete(2)
 
     def __init__(self, render_mode=None, cost=0.5):
         self.render_mode, self.cost = render_mode, cost
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.at = self.first(seed)
+        self.at, self.steps = self.first(seed), 0
         return self.see(), {}
 
     def first(self, seed):
         return int(self.np_random.integers(2, 6))
 
     def see(self):
-        return np.array([float(self.at)])
+        return cell(self.at)
 
     def step(self, action):
+        self.steps += 1
         self.at = (self.at + 2 * int(action) - 1) % 7
         return self.give(self.see(), 1.0 if self.at == 0 else -self.cost, self.at == 0)
 
@@ -52,73 +52,41 @@ class Walk(gymnasium.Env):
         return seen, reward, ended, False, {}
 
 
-# --- the same numbers as Walk ---------------------------------------------------------
+def see(function, space=None):
+    """A walk that shows `function` of its cell."""
+    spaces = {} if space is None else {"observation_space": space}
+    return {"see": lambda self: function(self.at), **spaces}
 
 
-class RewardInAnArray(Walk):
-    def give(self, seen, reward, ended):
-        return seen, np.array([reward], np.float32), ended, False, {}
+def give(function):
+    """A walk whose step returns `function` of observation, reward and end."""
+    return {"give": lambda self, *found: function(*found)}
 
 
-class NumpyScalars(Walk):
-    def give(self, seen, reward, ended):
-        return seen, np.float32(reward), np.bool_(ended), np.bool_(False), {}
+def rewards(function):
+    return give(lambda s, r, end: (s, function(r), end, False, {}))
 
 
-class EverythingInArrays(Walk):
-    def give(self, seen, reward, ended):
-        return seen, np.array([[reward]]), np.array([ended]), np.array(False), {}
+def ends(function, cut=False):
+    return give(lambda s, r, end: (s, r, function(end), cut, {}))
 
 
-class EndsInNumbers(Walk):
-    def give(self, seen, reward, ended):
-        return seen, fractions.Fraction(reward), int(ended), np.int8(0), {}
+def first(function):
+    """A walk whose reset calls `function` of the seed, and then starts."""
+
+    def start(self, seed):
+        function(seed)
+        return Walk.first(self, seed)
+
+    return {"first": start}
 
 
-class OneBuffer(Walk):
-    buffer = np.zeros(1)
-
-    def see(self):
-        self.buffer[0] = self.at
-        return self.buffer
+def fail(error):
+    raise error
 
 
-class ListsForArrays(Walk):
-    def see(self):
-        return [self.at]
-
-
-class Row(Walk):
-    def see(self):
-        return np.array([[float(self.at)]])
-
-
-class Bare(Walk):
-    observation_space = Box(-np.inf, np.inf, (), np.float64)
-
-    def see(self):
-        return float(self.at)
-
-
-class InATuple(Walk):
-    observation_space = Tuple((FREE,))
-
-    def see(self):
-        return (np.array([float(self.at)]),)
-
-
-class InADict(Walk):
-    observation_space = Dict({"at": Dict({"cell": FREE})})
-
-    def see(self):
-        return {"at": {"cell": np.array([float(self.at)])}}
-
-
-class InACoarserDict(Walk):
-    observation_space = Dict({"at": Box(-9.0, 9.0, (1,), np.int64)})
-
-    def see(self):
-        return {"at": np.array([float(self.at)])}
+def cell(at):
+    return np.array([float(at)])
 
 
 class ActionsFrom5(Walk):
@@ -133,18 +101,6 @@ class ModeWithoutDefault(Walk):
         if render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"no mode {render_mode}")
         super().__init__(render_mode, cost)
-
-
-class LegacySeed(Walk):
-    def first(self, seed):
-        np.random.RandomState(seed)
-        return super().first(seed)
-
-
-class SignedSeed(Walk):
-    def first(self, seed):
-        np.array([seed], np.int64).astype(np.int32, casting="same_value")
-        return super().first(seed)
 
 
 class NoEarlyReset(Walk):
@@ -169,16 +125,6 @@ class WornByResets(Walk):
         return super().first(seed) if self.resets == 1 else 5
 
 
-class OrderedInfo(Walk):
-    def give(self, seen, reward, ended):
-        return seen, reward, ended, False, collections.OrderedDict(at=self.at)
-
-
-class CloseFails(Walk):
-    def close(self):
-        raise RuntimeError("nothing to close")
-
-
 class HoldsAFile(Walk):
     def __init__(self, render_mode=None, cost=0.5):
         super().__init__(render_mode, cost)
@@ -188,266 +134,165 @@ class HoldsAFile(Walk):
         self.file.close()
 
 
-class SeedsTheGlobal(Walk):
-    def first(self, seed):
-        np.random.seed(seed % 1000)  # noqa: NPY002
-        return super().first(seed)
-
-
-class BothAtOnce(Walk):
-    def give(self, seen, reward, ended):
-        return seen, reward, ended, ended, {}
-
-
-# --- numbers of their own, all of them right ------------------------------------------
-
-
-class Numbered(Walk):
-    observation_space = Discrete(7)
+class OneBuffer(Walk):
+    buffer = np.zeros(1)
 
     def see(self):
-        return self.at
-
-
-class Several(Walk):
-    observation_space = MultiDiscrete([7, 2])
-
-    def see(self):
-        return np.array([self.at, self.at % 2])
-
-
-class Bits(Walk):
-    observation_space = MultiBinary(3)
-
-    def see(self):
-        return np.array([(self.at >> k) & 1 for k in range(3)], np.int8)
-
-
-class Picture(Walk):
-    observation_space = Box(0, 255, (4, 5, 3), np.uint8)
-
-    def see(self):
-        return np.full((4, 5, 3), 30 * self.at, np.uint8)
-
-
-# --- refused before any work ----------------------------------------------------------
-
-
-class OldReset(Walk):
-    def reset(self, *, seed=None, options=None):
-        return super().reset(seed=seed)[0]
-
-
-class OldStep(Walk):
-    def give(self, seen, reward, ended):
-        return seen, reward, ended, {}
-
-
-class NoSeed(Walk):
-    def reset(self):
-        return super().reset()
-
-
-class StepGivesNothing(Walk):
-    def give(self, seen, reward, ended):
-        return None
-
-
-class OtherShape(Walk):
-    observation_space = Box(-np.inf, np.inf, (3,), np.float64)
-
-
-class Growing(Walk):
-    observation_space = Box(-np.inf, np.inf, (2,), np.float64)
-
-    def see(self):
-        return np.zeros(2 + (self.at == 0))
-
-
-class TextSeen(Walk):
-    def see(self):
-        return np.array([str(self.at)])
-
-
-class NothingSeen(Walk):
-    def see(self):
-        return None
-
-
-class OutOfNumbers(Walk):
-    observation_space = Discrete(4)
-
-    def see(self):
-        return self.at
-
-
-class KeyMissing(Walk):
-    observation_space = Dict({"a": FREE, "b": FREE})
-
-    def see(self):
-        return {"a": np.zeros(1)}
-
-
-class NoTuple(Walk):
-    observation_space = Tuple((FREE,))
-
-    def see(self):
-        return np.array(5.0)
-
-
-class NothingInside(Walk):
-    observation_space = Dict({})
-
-    def see(self):
-        return {}
-
-
-class NotANumber(Walk):
-    def see(self):
-        return np.array([np.nan if self.at == 0 else self.at])
-
-
-class RewardOfNothing(Walk):
-    def give(self, seen, reward, ended):
-        return seen, None, ended, False, {}
-
-
-class RewardAsText(Walk):
-    def give(self, seen, reward, ended):
-        return seen, str(reward), ended, False, {}
-
-
-class TwoRewards(Walk):
-    def give(self, seen, reward, ended):
-        return seen, np.array([reward, reward]), ended, False, {}
-
-
-class EndlessReward(Walk):
-    def give(self, seen, reward, ended):
-        return seen, np.inf, ended, False, {}
-
-
-class EndsInWords(Walk):
-    def give(self, seen, reward, ended):
-        return seen, reward, "done" if ended else "", False, {}
-
-
-class CutIsNothing(Walk):
-    def give(self, seen, reward, ended):
-        return seen, reward, ended, None, {}
-
-
-class InfoIsNothing(Walk):
-    def give(self, seen, reward, ended):
-        return seen, reward, ended, False, None
-
-
-class NotMade(Walk):
-    def __init__(self, render_mode=None, cost=0.5):
-        raise OSError("no simulator on this machine")
-
-
-class NoReset(Walk):
-    def first(self, seed):
-        raise KeyError("no map")
-
-
-class NoStep(Walk):
-    def see(self):
-        if self.at == 0:
-            raise IndexError("off the map")
-        return super().see()
-
-
-class Leaves(Walk):
-    def give(self, seen, reward, ended):
-        sys.exit("bye")
-
-
-class Huge(Walk):
-    def see(self):
-        return np.array([1e300 * self.at])
-
-
-class NoSpace(Walk):
-    observation_space = None
-
-
-class Words(Walk):
-    observation_space = Dict({"at": FREE, "goal": Text(9)})
-
-    def see(self):
-        return {"at": np.array([float(self.at)]), "goal": "go"}
-
-
-class Continuous(Walk):
-    action_space = Box(-1.0, 1.0, (1,))
-
-
-class SeveralActions(Walk):
-    action_space = MultiDiscrete([2, 2])
-
-
-class Unseeded(Walk):
-    def see(self):
-        return np.array([self.at + np.random.default_rng().random()])
-
-
-class LateDice(Walk):
+        self.buffer[0] = self.at
+        return self.buffer
+
+
+COARSE = Dict({"at": box(1, low=-9, high=9, dtype=np.int64)})
+#: They learn the same numbers as Walk.
+SAME = {
+    "RewardInAnArray": rewards(lambda r: np.array([r])),
+    "RewardInNumPy": rewards(np.float32),
+    "EndsInArrays": ends(lambda end: np.array([end]), np.array(False)),
+    "EndsInNumPy": ends(np.bool_, np.bool_(0)),
+    "EndsInNumbers": ends(int, np.int8(0)),
+    "BothAtOnce": give(lambda s, r, end: (s, r, end, end, {})),
+    "OrderedInfo": give(lambda *found: (*found, False, collections.OrderedDict(a=1))),
+    "ListsForArrays": see(lambda at: [at]),
+    "Row": see(lambda at: np.array([[float(at)]])),
+    "Bare": see(float, box()),
+    "InATuple": see(lambda at: (cell(at),), Tuple((box(1),))),
+    "InADict": see(lambda at: {"a": {"b": cell(at)}}, Dict(a=Dict(b=box(1)))),
+    "InACoarserDict": see(lambda at: {"at": cell(at)}, COARSE),
+    "LegacySeed": first(np.random.RandomState),
+    "SignedSeed": first(lambda n: np.array(n).astype(np.int32, casting="same_value")),
+    "SeedsTheGlobal": first(lambda seed: np.random.seed(seed % 1000)),  # noqa: NPY002
+    "CloseFails": {"close": lambda self: fail(RuntimeError("nothing to close"))},
+}
+CLASSES = [Walk, ActionsFrom5, ModeWithoutDefault, NoEarlyReset, WornByResets]
+CLASSES += [HoldsAFile, OneBuffer]
+
+
+def bits(at):
+    return np.array([at >> k & 1 for k in range(3)], np.int8)
+
+
+def picture(at):
+    return np.full((4, 5, 3), 30 * at, np.uint8)
+
+
+#: Vectors that stand for the cell: the expected vector, and what the walk shows.
+VECTORS = {
+    "Numbered": (lambda at: np.eye(7)[at], see(int, Discrete(7))),
+    "Several": (
+        lambda at: np.r_[np.eye(7)[at], np.eye(2)[at % 2]],
+        see(lambda at: np.array([at, at % 2]), MultiDiscrete([7, 2])),
+    ),
+    "Bits": (bits, see(bits, MultiBinary(3))),
+    "Picture": (
+        lambda at: np.full(60, 30.0 * at),
+        see(picture, box(4, 5, 3, low=0, high=255, dtype=np.uint8)),
+    ),
+}
+COUNTS = collections.Counter()  # what all simulators share
+
+
+def shared(at):
+    COUNTS["steps"] += 1
+    return cell(at + COUNTS["steps"] % 5)
+
+
+def late_dice(self, action):
     """Random without a seed, but only after many steps."""
-
-    def reset(self, *, seed=None, options=None):
-        self.steps = 0
-        return super().reset(seed=seed)
-
-    def step(self, action):
-        self.steps += 1
-        late = self.steps > 70
-        noise = float.fromhex(os.urandom(4).hex()) if late else 0.0
-        return np.array([self.steps + noise]), -1.0, False, False, {}
+    self.steps += 1
+    noise = float.fromhex(os.urandom(4).hex()) if self.steps > 70 else 0.0
+    return np.array([self.steps + noise]), -1.0, False, False, {}
 
 
-class OutlivesAll(Walk):
-    episodes = [0]  # noqa: RUF012
+LATER = first(lambda seed: COUNTS.update(episodes=1))
+LATER |= see(lambda at: cell(at + COUNTS["episodes"]))
+WORDS = Dict({"at": box(1), "goal": Text(9)})
 
-    def first(self, seed):
-        self.episodes[0] += 1
-        return super().first(seed)
-
-    def see(self):
-        return np.array([float(self.at + self.episodes[0])])
-
-
-class Shared(Walk):
-    """All simulators walk on one ring."""
-
-    ring = {}  # noqa: RUF012
-
-    def see(self):
-        self.ring["steps"] = self.ring.get("steps", 0) + 1
-        return np.array([float(self.at), float(self.ring["steps"] % 5)])[:1] + (
-            self.ring["steps"] % 5
-        )
-
-
-class Clock(Walk):
-    def see(self):
-        return np.array([self.at + time.perf_counter()])
-
-
-# --- well-behaved until a run is under way --------------------------------------------
+#: Rejected before any work: words of the message, which names the method, the answer
+#: and what is expected; and what is odd.
+REJECTED = {
+    "OldReset": ("reset … array … 0.26", {"reset": lambda self, **_: np.zeros(1)}),
+    "OldStep": (
+        "step … 4 values … truncated",
+        give(lambda s, r, end: (s, r, end, {})),
+    ),
+    "NoSeed": (
+        "reset … seed … reset(*, seed=None, options=None)",
+        {"reset": lambda self: Walk.reset(self)},
+    ),
+    "StepGivesNothing": ("step … None … 5 values", give(lambda *_: None)),
+    "OtherShape": ("reset … (1,) … (3,)", {"observation_space": box(3)}),
+    "Growing": ("step … (3,) … (2,)", see(lambda at: np.zeros(2 + (at == 0)), box(2))),
+    "TextSeen": ("reset … <U1 … numbers", see(lambda at: np.array([str(at)]))),
+    "NothingSeen": ("reset … None … numbers", see(lambda at: None)),
+    "OutOfNumbers": ("Discrete(4) … type int … member", see(int, Discrete(4))),
+    "KeyMissing": (
+        "reset … 'a' … 'b'",
+        see(lambda at: {"a": cell(at)}, Dict(a=box(1), b=box(1))),
+    ),
+    "NoTuple": ("reset … 5. … member of Tuple", see(lambda at: 5.0, Tuple((box(1),)))),
+    "NothingInside": ("reset … 0 numbers … 1", see(lambda at: {}, Dict({}))),
+    "NotANumber": ("step … nan … finite", see(lambda at: np.array([at or np.nan]))),
+    "Huge": ("reset … e+300 … float32", see(lambda at: np.array([1e300 * at]))),
+    "RewardOfNothing": ("step … reward None … number", rewards(lambda r: None)),
+    "RewardAsText": ("step … reward '-0.5' … number", rewards(str)),
+    "TwoRewards": ("step … (2,) … number", rewards(lambda r: np.array([r, r]))),
+    "EndlessReward": ("step … reward inf … finite", rewards(lambda r: np.inf)),
+    "EndsInWords": ("step … terminated '' … True or False", ends(lambda end: "")),
+    "CutIsNothing": ("step … truncated None … True or False", ends(bool, None)),
+    "InfoIsNothing": (
+        "step … info None … dict",
+        give(lambda *found: (*found, False, None)),
+    ),
+    "NotMade": (
+        "constructor … OSError: no simulator … odd.py:",
+        {"__init__": lambda self: fail(OSError("no simulator here"))},
+    ),
+    "NoReset": (
+        "reset … KeyError: 'no map' … odd.py:",
+        first(lambda seed: fail(KeyError("no map"))),
+    ),
+    "NoStep": (
+        "step … IndexError: off … odd.py:",
+        see(lambda at: cell(at) if at else fail(IndexError("off"))),
+    ),
+    "Leaves": ("step … SystemExit: bye … odd.py:", give(lambda *_: sys.exit("bye"))),
+    "NoSpace": ("observation_space … None … gymnasium", {"observation_space": None}),
+    "Words": (
+        "observations … Text … filter_keys: [at]",
+        see(lambda at: {"at": cell(at), "goal": "go"}, WORDS),
+    ),
+    "Continuous": (
+        "actions … Box … {name: DiscretizeAction, bins: 5}",
+        {"action_space": box(1, low=-1.0, high=1.0)},
+    ),
+    "SeveralActions": (
+        "actions … MultiDiscrete … Discrete",
+        {"action_space": MultiDiscrete([2, 2])},
+    ),
+    "Unseeded": (
+        "reset … episode 1 … reset(seed=…)",
+        see(lambda at: cell(at + np.random.default_rng().random())),
+    ),
+    "LateDice": ("step 71 … episode 1 … reset(seed=…)", {"step": late_dice}),
+    "OutlivesAll": ("reset … episode 1 … outlives a reset", LATER),
+    "Shared": ("differs … expected … share", see(shared)),
+    "Clock": (
+        "reset … episode 1 … same reset and actions",
+        see(lambda at: cell(at + time.perf_counter())),
+    ),
+}
 
 
 class FailsLate(Walk):
     """Raises in the episodes of some resets, which the check before work never sees."""
 
-    def reset(self, *, seed=None, options=None):
-        self.doomed = 0 < seed % 64 <= self.doom
-        return super().reset(seed=seed)
-
     def __init__(self, render_mode=None, cost=0.5, doom=0):
         super().__init__(render_mode, cost)
         self.doom = doom
+
+    def reset(self, *, seed=None, options=None):
+        self.doomed = 0 < seed % 64 <= self.doom
+        return super().reset(seed=seed)
 
     def give(self, seen, reward, ended):
         if self.doomed:
@@ -455,7 +300,8 @@ class FailsLate(Walk):
         return seen, reward, ended, False, {}
 
 
-for name, cls in list(globals().items()):
-    if isinstance(cls, type) and issubclass(cls, Walk):
-        steps = 90 if cls is LateDice else 12
-        gymnasium.register(f"odd/{name}-v0", cls, max_episode_steps=steps)
+ODD = SAME | {name: changes for name, (_, changes) in (VECTORS | REJECTED).items()}
+CLASSES += [FailsLate, *(type(name, (Walk,), changes) for name, changes in ODD.items())]
+for cls in CLASSES:
+    steps = 90 if cls.__name__ == "LateDice" else 12
+    gymnasium.register(f"odd/{cls.__name__}-v0", cls, max_episode_steps=steps)

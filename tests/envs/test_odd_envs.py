@@ -11,13 +11,12 @@ import pytest
 from gymnasium import spaces
 
 from bcrl.api import DQN, FQI, Forest, Gymnasium, run, stages
-from bcrl.config import vetting
-from bcrl.envs import Success
-from bcrl.envs._contract import Simulator
+from bcrl.envs._recipe import Recipe
+from bcrl.envs.simulators import Simulator
 from bcrl.errors import BcrlError
 from bcrl.learning.rollout import rollout
 from bcrl.run import runner
-from tests.conftest import arguments, plan
+from tests.conftest import plan, plans
 from tests.envs import odd
 
 SMALL = ("env=gymnasium", "scale=smoke", "progress=none", "seeds.count=1", "tag=t")
@@ -38,95 +37,51 @@ def plain():
     return results("Walk")
 
 
-SAME = (odd.RewardInAnArray, odd.NumpyScalars, odd.EverythingInArrays, odd.OneBuffer)
-SAME += (odd.ListsForArrays, odd.Row, odd.Bare, odd.InATuple, odd.InADict)
-SAME += (odd.ActionsFrom5, odd.ModeWithoutDefault, odd.LegacySeed, odd.SignedSeed)
-SAME += (odd.NoEarlyReset, odd.OrderedInfo, odd.CloseFails, odd.HoldsAFile)
-SAME += (odd.WornByResets, odd.SeedsTheGlobal, odd.BothAtOnce, odd.EndsInNumbers)
-SAME += (odd.InACoarserDict,)
+SAME = [*odd.SAME, "ActionsFrom5", "ModeWithoutDefault", "NoEarlyReset"]
+SAME += ["WornByResets", "HoldsAFile", "OneBuffer"]
 
 
-@pytest.mark.parametrize("cls", SAME, ids=lambda cls: cls.__name__)
-def test_what_is_adapted_gives_the_numbers_of_the_plain_one(cls, plain):
-    pd.testing.assert_frame_equal(results(cls.__name__), plain)
+@pytest.mark.parametrize("name", SAME)
+def test_adapted_answers_give_the_numbers_of_the_plain_walk(name, plain):
+    pd.testing.assert_frame_equal(results(name), plain)
 
 
 def test_dqn_takes_adapted_environments_too():
     learner = DQN(40, 10, 10, evaluate_every=20, evaluation_episodes=2)
     plain = results("Walk", learner)
-    for name in ("EverythingInArrays", "OneBuffer", "NoEarlyReset", "WornByResets"):
+    for name in ("EndsInArrays", "OneBuffer", "NoEarlyReset", "WornByResets"):
         pd.testing.assert_frame_equal(results(name, learner), plain)
 
 
-@pytest.mark.parametrize(
-    ("cls", "seen"),
-    [
-        (odd.Numbered, lambda at: np.eye(7)[at]),
-        (odd.Several, lambda at: np.r_[np.eye(7)[at], np.eye(2)[at % 2]]),
-        (odd.Bits, lambda at: np.array([at & 1, at >> 1 & 1, at >> 2 & 1], float)),
-        (odd.Picture, lambda at: np.full(60, 30.0 * at)),
-    ],
-)
-def test_observations_become_vectors(cls, seen):
-    task, twin = (Gymnasium(f"odd/{c.__name__}-v0") for c in (cls, odd.Walk))
+@pytest.mark.parametrize("name", odd.VECTORS)
+def test_observations_become_vectors(name):
+    task, twin = (Gymnasium(f"odd/{each}-v0") for each in (name, "Walk"))
     lanes, plain = task.lanes(), twin.lanes()
     start = np.random.default_rng(0).random((9, 1))
     state, at = lanes.begin(start), plain.begin(start)
     for _ in range(3):
-        np.testing.assert_array_equal(state, [seen(int(x)) for x in at[:, 0]])
+        expected = [odd.VECTORS[name][0](int(x)) for x in at[:, 0]]
+        np.testing.assert_array_equal(state, expected)
         action = np.arange(9) % 2
         state, at = (x.step(None, action, None)[0] for x in (lanes, plain))
 
 
-#: What each message has to name, besides env.id: the method, what came, what is right.
-REFUSED = {
-    odd.OldReset: ("reset", "array", "0.26"),
-    odd.OldStep: ("step", "4 values", "truncated"),
-    odd.NoSeed: ("reset", "seed", "reset(*, seed=None, options=None)"),
-    odd.StepGivesNothing: ("step", "None", "5:"),
-    odd.OtherShape: ("reset", "(1,)", "(3,)"),
-    odd.Growing: ("step", "(3,)", "(2,)"),
-    odd.TextSeen: ("reset", "<U1", "numbers"),
-    odd.NothingSeen: ("reset", "None", "numbers"),
-    odd.OutOfNumbers: ("Discrete(4)", "type int", "member"),
-    odd.KeyMissing: ("reset", "'a'", "'b'"),
-    odd.NoTuple: ("reset", "5.", "member of Tuple"),
-    odd.NothingInside: ("reset", "nothing", "one number"),
-    odd.NotANumber: ("step", "nan", "finite"),
-    odd.RewardOfNothing: ("step", "reward None", "number"),
-    odd.RewardAsText: ("step", "reward '-0.5'", "number"),
-    odd.TwoRewards: ("step", "(2,)", "number"),
-    odd.EndlessReward: ("step", "reward inf", "finite"),
-    odd.EndsInWords: ("step", "terminated ''", "True or False"),
-    odd.CutIsNothing: ("step", "truncated None", "True or False"),
-    odd.InfoIsNothing: ("step", "info None", "dict"),
-    odd.NotMade: ("constructor", "OSError: no simulator", "odd.py:"),
-    odd.NoReset: ("reset", "KeyError: 'no map'", "odd.py:"),
-    odd.NoStep: ("step", "IndexError: off the map", "odd.py:"),
-    odd.Leaves: ("step", "SystemExit: bye", "odd.py:"),
-    odd.Huge: ("reset", "e+300", "float32"),
-    odd.NoSpace: ("observation_space", "None", "gymnasium"),
-    odd.Words: ("observations", "Text", "filter_keys: [at]"),
-    odd.Continuous: ("actions", "Box", "{name: DiscretizeAction, bins: 5}"),
-    odd.SeveralActions: ("actions", "MultiDiscrete", "Discrete"),
-    odd.Unseeded: ("reset", "episode 1", "reset(seed=…)"),
-    odd.LateDice: ("step 71", "episode 1", "reset(seed=…)"),
-    odd.OutlivesAll: ("reset", "episode 1", "outlives a reset"),
-    odd.Shared: ("another", "expected", "share"),
-    odd.Clock: ("reset", "episode 1", "same reset and actions"),
-}
-
-
-@pytest.mark.parametrize("cls", REFUSED, ids=lambda cls: cls.__name__)
-def test_what_breaks_the_contract_is_refused_before_work(cls, tmp_path):
-    name = f"odd/{cls.__name__}-v0"
-    with pytest.raises(BcrlError) as refused:
-        vetting.plans(arguments(*SMALL, f"env.id={name}", f"runs_dir={tmp_path}/runs"))
-    text = str(refused.value)
-    assert text.startswith(f"env.id={name}: ") and "\n" not in text
-    for part in REFUSED[cls]:
+@pytest.mark.parametrize("name", odd.REJECTED)
+def test_a_broken_contract_is_named(name):
+    with pytest.raises(BcrlError) as rejected:
+        Gymnasium.check_tasks([Gymnasium(f"odd/{name}-v0", success="absorbed")])
+    text = str(rejected.value)
+    assert text.startswith(f"env.id=odd/{name}-v0: ") and "\n" not in text
+    for part in odd.REJECTED[name][0].split(" … "):
         assert part in text
-    assert refused.value.exit_code == 2 and not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("name", ["OldStep", "LateDice"])
+def test_a_command_rejects_it_before_any_work(name, tmp_path):
+    given = (f"env.id=odd/{name}-v0", f"runs_dir={tmp_path}/runs")
+    with pytest.raises(BcrlError) as rejected:
+        plans(*SMALL, *given)
+    assert rejected.value.exit_code == 2 and not (tmp_path / "runs").exists()
 
 
 def held() -> int:
@@ -206,49 +161,25 @@ def test_a_simulator_that_fails_in_a_run_fails_its_seed_alone(more, tmp_path):
         assert not good or one == other
 
 
-def test_one_message_and_no_traceback_from_the_command(bcrl, tmp_path):
-    (tmp_path / "broken.py").write_text(
-        "import gymnasium\nfrom gymnasium.envs.classic_control import CartPoleEnv\n\n\n"
-        "class Broken(CartPoleEnv):\n    def step(self, action):\n"
-        "        return super().step(action)[:4]\n\n\n"
-        "gymnasium.register('Broken-v0', Broken, max_episode_steps=9)\n"
-    )
-    os.environ |= {"BCRL_TRUST": "broken", "PYTHONPATH": str(tmp_path)}
-    try:
-        done = bcrl(*SMALL, "env.id=broken:Broken-v0")
-    finally:
-        del os.environ["BCRL_TRUST"], os.environ["PYTHONPATH"]
-    assert done.returncode == 2 and "Traceback" not in done.stderr
-    (line,) = done.stderr.splitlines()
-    assert line.startswith("bcrl: env.id=broken:Broken-v0: step gave 4 values")
-    assert not (tmp_path / "runs").exists()
-
-
-def test_what_info_says_of_success_has_to_be_true_or_false():
-    simulator = Simulator(Gymnasium("odd/Walk-v0"))
+def test_success_in_info_has_to_be_true_or_false():
+    simulator = Simulator(Recipe("odd/Walk-v0"))
     for value, expected in ((1, True), (np.array([True]), True), (False, False)):
-        assert simulator._flag("step", {"success": value}) is expected
-        assert simulator.reports
         simulator.reports = False
+        assert simulator._success("step", {"success": value}) is expected
+        assert simulator.reports
+    simulator.reports = False
     for value in ("no", None, 0.3, np.nan, {}):
-        assert not simulator._flag("step", {"success": value})
+        assert not simulator._success("step", {"success": value})
         assert not simulator.reports
 
 
-def test_no_cast_hides_what_float32_cannot_tell_apart():
+def test_no_cast_hides_what_float32_cannot_resolve():
     seen = np.array([1.7e9 + 3])
     space = spaces.Dict({"time": spaces.Box(-np.inf, np.inf, (1,), np.float32)})
-    simulator = Simulator(Gymnasium("odd/Walk-v0"))
-    (found,) = simulator._parts("reset", space, {"time": seen})
-    assert found[0] == seen[0]
+    simulator = Simulator(Recipe("odd/Walk-v0"))
+    assert simulator._flat("reset", space, {"time": seen})[0] == seen[0]
 
 
 def test_a_registered_threshold_of_zero_is_one():
     gymnasium.register("odd/Zero-v0", odd.Walk, 0.0, max_episode_steps=12)
     assert Gymnasium("odd/Zero-v0", success="threshold").success_threshold == 0.0
-    task = Gymnasium("odd/Zero-v0")
-    object.__setattr__(task, "success", "auto")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bcrl.envs.gymnasium.default", lambda *_: Success("threshold"))
-        task._resolve_success(0.0)
-    assert (task.success, task.success_threshold) == ("threshold", 0.0)

@@ -1,4 +1,4 @@
-"""Environments of other packages learn by the very commands of docs/gymnasium.md."""
+"""Environments of other packages learn (docs/howto/other_packages.md)."""
 
 import importlib.util
 import os
@@ -11,16 +11,13 @@ import pytest
 from bcrl.run import records, runner
 from tests.conftest import plans
 
-SECTION = re.search(
-    r"## Environments of other packages\n(.*?)\n## ",
-    (Path(__file__).parents[2] / "docs" / "gymnasium.md").read_text(encoding="utf-8"),
-    re.S,
-)[1]
+PAGE = Path(__file__).parents[2] / "docs" / "howto" / "other_packages.md"
+SECTION = PAGE.read_text(encoding="utf-8")
 COMMANDS = {
     re.search(r"env\.id=(?:\w+:)?(\S+)", line)[1]: shlex.split(line)
     for line in re.findall(r"^bcrl .*$", SECTION, re.M)
 }
-#: What has to be there for an environment, besides Gymnasium itself.
+#: The module that an environment needs besides Gymnasium, by its name's beginning.
 MODULES = {"Lunar": "Box2D", "Biped": "Box2D", "MiniGrid": "minigrid", "ALE": "ale_py"}
 #: CI sets this, so that a missing package is a failure there.
 REQUIRED = os.environ.get("BCRL_ENVIRONMENTS") == "required"
@@ -41,6 +38,7 @@ def test_the_page_has_a_command_and_a_row_for_each():
     assert rows == list(COMMANDS) and len(rows) == 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_fqi_and_dqn_learn_it_plain_and_with_a_boosted_curriculum(name, tmp_path):
     for begins, module in MODULES.items():
@@ -50,7 +48,7 @@ def test_fqi_and_dqn_learn_it_plain_and_with_a_boosted_curriculum(name, tmp_path
     _, multirun, *overrides = COMMANDS[name]
     assert multirun == "-m"
     overrides = [o for o in overrides if not o.startswith("env.horizon=")]
-    overrides.remove("algorithm=fqi,dqn")  # for each has budgets of its own
+    overrides.remove("algorithm=fqi,dqn")  # their budgets differ
     overrides += [*SMALLER, f"runs_dir={tmp_path}"]
     made = [
         each

@@ -1,4 +1,4 @@
-"""What an environment of the user's may get wrong is named before any work."""
+"""Errors in a user's environment or script are named before any work."""
 
 import sys
 from dataclasses import dataclass
@@ -26,57 +26,51 @@ def changed(change):
     return {"step": lambda *a: step(*a, change=change)}
 
 
+DICE, BUFFER = iter(range(1000)), {}
+#: The change, and words of the message.
 WRONG = {
-    "other states": ({"state_dim": 2}, r"initial: the states have shape \(2, 3, 1\)"),
-    "no number": ({"initial_noise": None}, "initial_noise must be a number"),
+    "other states": ({"state_dim": 2}, r"initial: states have shape \(16, 4, 1\)"),
+    "no number": ({"initial_noise": None}, "initial_noise is None"),
     "rewards with an axis": (
         changed(lambda s, r, a: (s, r[..., None], a)),
-        r"rewards have shape \(2, 3, 1\), expected \(2, 3\)",
+        r"rewards have shape \(16, 4, 1\), expected \(16, 4\)",
     ),
     "no booleans": (changed(lambda s, r, a: (s, r, {})), "absorbing have shape None"),
-    "numbers for booleans": (
-        changed(lambda s, r, a: (s, r, 1.0 * a)),
-        "must be booleans",
-    ),
-    "two values": (changed(lambda s, r, a: (s, r)), "step must give"),
-    "no reward": (changed(lambda s, r, a: (s, r * np.nan, a)), "not finite"),
+    "floats as ends": (changed(lambda s, r, a: (s, r, 1.0 * a)), "must be booleans"),
+    "two values": (changed(lambda s, r, a: (s, r)), "2 values"),
+    "no reward": (changed(lambda s, r, a: (s, r * np.nan, a)), "finite"),
     "dice": (changed(lambda s, r, a: (s, r + next(DICE), a)), "comes in as noise"),
+    "late dice": (
+        changed(lambda s, r, a: (s, r + (s[..., 0] == 4) * next(DICE), a)),
+        "comes in as noise",
+    ),
     "an exception": ({"step": lambda *_: 1 / 0}, "step failed: ZeroDivisionError"),
-    "states in place": (
+    "an exit": ({"step": lambda *_: sys.exit(3)}, "SystemExit: 3"),
+    "noise changed in place": (
         {"initial": lambda self, noise: np.add(noise, 1, out=noise)},
         "changes its arguments",
     ),
+    "states that grow without bound": (
+        changed(lambda s, r, a: (np.where(s == 4, 1e39, s), r, a)),
+        "step: states .*float32",
+    ),
+    "one buffer": (
+        changed(lambda s, r, a: (BUFFER.setdefault(s.shape, s), r, a)),
+        "one array again and again",
+    ),
+    "no threshold": ({"success": "threshold"}, "success_threshold is None"),
+    "an unknown rule": ({"success": "info"}, "success=info"),
+    "no hash": ({"__hash__": lambda self: hash([])}, "tuple.*list"),
+    "no start": (
+        {"evaluation_states": lambda self: np.zeros((0, 1))},
+        "evaluation_states: states have shape",
+    ),
+    "nothing for a start": ({"evaluation_states": lambda self: None}, "shape None"),
 }
-DICE = iter(range(100))
-WRONG["states that grow without bound"] = (
-    changed(lambda s, r, a: (np.where(s == 4, 1e39, s), r, a)),
-    "step gives states .*float32",
-)
-WRONG["late dice"] = (
-    changed(lambda s, r, a: (s, r + (s[..., 0] == 4) * next(DICE), a)),
-    "comes in as noise",
-)
-WRONG["one buffer"] = (
-    changed(lambda s, r, a: (BUFFER.setdefault(s.shape, s), r, a)),
-    "one array again and again",
-)
-BUFFER = {}
-WRONG["no threshold"] = ({"success": "threshold"}, "success_threshold must be")
-WRONG["no hash"] = ({"__hash__": lambda self: hash([])}, "tuple.*list")
-WRONG["no start"] = (
-    {"evaluation_states": lambda self: np.zeros((0, 1))},
-    "evaluation_states have shape",
-)
-WRONG["nothing for a start"] = (
-    {"evaluation_states": lambda self: None},
-    "evaluation_states have shape None",
-)
-WRONG["an exit"] = ({"step": lambda *_: sys.exit(3)}, "SystemExit: 3")
-WRONG["an unknown rule"] = ({"success": "info"}, "success is 'info'")
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_is_wrong_is_said(name):
+def test_a_broken_contract_is_named(name):
     changes, words = WRONG[name]
     with pytest.raises(ConfigError, match=words):
         stages([variant(**changes)], LEARNER)
@@ -88,13 +82,8 @@ def test_an_environment_that_is_right_passes():
 
 
 def test_a_parameter_has_to_have_an_effect():
-    ignored = dataclass(frozen=True)(
-        type(
-            "Mine",
-            (OpenCorridor,),
-            {"step": lambda self, *given: OpenCorridor(1.0).step(*given)},
-        )
-    )
+    step = {"step": lambda self, *given: OpenCorridor(1.0).step(*given)}
+    ignored = dataclass(frozen=True)(type("Mine", (OpenCorridor,), step))
     with pytest.raises(ConfigError, match="behave alike"):
         stages([ignored(prize=1.0), ignored(prize=2.0)], LEARNER)
     ignored.verify = False
@@ -117,7 +106,7 @@ def test_stages_refuses_what_makes_no_sense(tasks, learner, transfers, words):
         stages(tasks, learner, *transfers)
 
 
-@pytest.mark.parametrize("seeds", [3, [], [0, 0], [-1]])
+@pytest.mark.parametrize("seeds", [3, [], [0, 0], [-1], np.int64(3), [0.5]])
 def test_seeds_are_different_numbers(seeds):
     with pytest.raises(ConfigError, match="seeds"):
         run(stages([OpenCorridor()], LEARNER), seeds, progress=False)
@@ -133,7 +122,7 @@ def test_an_estimator_of_scikit_learn_is_to_be_wrapped():
 
 @pytest.mark.parametrize("values", [{"horizon": 0}, {"horizon": 3.0}, {"gamma": 1.0}])
 def test_horizon_and_discount_are_checked(values):
-    with pytest.raises(ConfigError, match=f"{next(iter(values))} must be a number"):
+    with pytest.raises(ConfigError, match=next(iter(values))):
         stages([OpenCorridor(**values)], LEARNER)
 
 
@@ -152,6 +141,3 @@ def test_what_is_no_environment_is_named(tasks):
         stages(tasks, LEARNER)
     with pytest.raises(ConfigError, match="None: is no learner"):
         stages([OpenCorridor()], None)
-    for seeds in (np.int64(3), [0.5]):
-        with pytest.raises(ConfigError, match="seeds="):
-            run(stages([OpenCorridor()], LEARNER), seeds, progress=False)

@@ -22,7 +22,7 @@ from bcrl.api import (
     stages,
 )
 from bcrl.common.seeding import stream
-from bcrl.learning.lockstep import BLOCK
+from bcrl.learning.dqn import BLOCK
 from bcrl.learning.stage import SeedBatch, learn
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -67,7 +67,7 @@ def test_fitted_q_iteration_is_the_engines(masses):
 
     datasets = [
         (d.points[d.state], d.action, d.reward, d.points[d.next_state], d.absorbing)
-        for d in (now.learned.data[0] for now in ends)
+        for d in (now.result.data[0] for now in ends)
     ]
     paths = product(range(1, len(tasks) + 1), range(1, iterations + 1), range(2))
     draws = (stream(SEED, "trees", *path) for path in paths)
@@ -76,7 +76,7 @@ def test_fitted_q_iteration_is_the_engines(masses):
 
     states = np.random.default_rng(0).uniform((-1, -3), (1, 3), (500, 2))
     for number, now in enumerate(ends, start=1):
-        (expected,) = now.learned.q([states], 2)
+        (expected,) = now.result.q([states], 2)
         assert abs(expected).max() > 0.1
         found = fqi.q_values(residuals[:number], states)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
@@ -144,7 +144,7 @@ class EngineDraws:
 
 def network_of(moment):
     """The example's network with the weights of an engine's moment."""
-    relu, online = torch.nn.ReLU(), moment.learned.residual.online
+    relu, online = torch.nn.ReLU(), moment.result.residual.online
     first, second, last = (
         torch.nn.Linear(*weights.shape[1:]) for weights, _ in online.layers
     )
@@ -160,7 +160,7 @@ def trained():
     settings = DQN(steps=800, target_update=100, evaluate_every=50)
     tasks = [LinearSystem("lq", horizon=100), Pathway()]
     moments = engine(tasks, [LSPI(), settings], Boost(), Shape())
-    base = next(now for now in moments if now.last_of_stage).learned.q.matrix[0]
+    base = next(now for now in moments if now.last_of_stage).result.q.matrix[0]
     first, losses = network_of(next(moments)), []
     for now in moments:
         losses.append(now.loss[0])

@@ -11,7 +11,7 @@ from bcrl.learning.fqi import FQI
 from bcrl.learning.rollout import transition_tables
 from bcrl.learning.stage import SeedBatch, Stage
 from bcrl.learning.stage import learn as learn_stages
-from bcrl.learning.transfer import Boost, Shape, StageResult, begin, warm_start
+from bcrl.learning.transfer import Boost, Shape, begin, warm_start
 from bcrl.q.functions import ZERO, Sum, Table, Zero, add
 from bcrl.q.regressors.ours import ForestRegressor, Tabular
 from tests.toys import Corridor, OpenCorridor
@@ -34,8 +34,8 @@ def stages(
 
 
 def learn(tasks, *transfers, seeds=(0, 1), **options):
-    team = SeedBatch(seeds, Corridor().states())
-    return list(learn_stages(stages(tasks, transfers, **options), team))
+    batch = SeedBatch(seeds, Corridor().states())
+    return list(learn_stages(stages(tasks, transfers, **options), batch))
 
 
 def test_the_target_is_equation_5_by_hand():
@@ -55,58 +55,41 @@ def test_the_target_is_equation_5_by_hand():
 def test_with_an_exact_regressor_it_is_value_iteration(transfers):
     tasks = [Corridor(prize=-1.0), Corridor(prize=3.0)]
     snapshots = learn(tasks, *transfers)
+    first, last = snapshots[119], snapshots[-1]
+    assert first.last_of_stage and snapshots[120].stage.number == 2
     q_star = optimal_q(*transition_tables(tasks[-1]), tasks[-1].gamma)
-    for q in snapshots[-1].probed_q:
+    for s, q in enumerate(last.probed_q):
         assert np.allclose(q[:5], q_star[:5], atol=1e-5)  # cell 5 ends the episode
+        if transfers == (Boost(),):  # learns the difference between the tasks
+            residual = q - first.probed_q[s]
+            assert np.allclose(last.probed_residual[s][:5], residual[:5], atol=1e-9)
 
 
-def test_boosting_learns_the_difference_between_two_tasks():
-    tasks = [Corridor(prize=1.0), Corridor(prize=3.0)]
-    snapshots = learn(tasks, Boost())
-    first = next(x for x in snapshots if x.last_of_stage)
-    last = snapshots[-1]
-    for s in range(2):
-        residual = last.probed_q[s] - first.probed_q[s]
-        assert np.allclose(last.probed_residual[s][:5], residual[:5], atol=1e-9)
-    assert snapshots[120].stage.number == 2
-
-
-def test_a_boosted_stage_starts_at_the_previous_q_and_a_zero_residual():
-    q, residual = (Table([np.full((6, 2), x)], Corridor()) for x in (2.0, 1.0))
-    previous = StageResult(q, residual)
-    boosted = begin([Boost()], previous)
-    assert boosted.base is q and boosted.initial is ZERO
-    warm = begin([warm_start], previous)
-    assert warm.base is ZERO and warm.initial is residual
-
-
-def test_tabulated_and_general_evaluation_agree_with_the_same_forests():
+@pytest.mark.parametrize("transfers", [(Boost(),), (Boost(), Shape())])
+def test_tabulated_and_general_evaluation_agree_with_the_same_forests(transfers):
     options = {"regressor": ForestRegressor(trees=5), "iterations": 4}
-    for transfers in ([Boost()], [Boost(), Shape()]):
-        fast = learn([Corridor(), Corridor(prize=2.0)], *transfers, **options)
-        open_tasks = [OpenCorridor(), OpenCorridor(prize=2.0)]
-        plain = learn(open_tasks, *transfers, **options)
-        states = Corridor().states()
-        for a, b in zip(fast, plain, strict=True):
-            for s in range(2):
-                seen = a.probed_q[s]
-                asked = b.learned.q([states, states], 2)[s]
-                # The table asks for all cells, the general way for those in the data.
-                assert np.allclose(seen[:5], asked[:5], atol=1e-12)
+    fast = learn([Corridor(), Corridor(prize=2.0)], *transfers, **options)
+    plain = learn([OpenCorridor(), OpenCorridor(prize=2.0)], *transfers, **options)
+    states = Corridor().states()
+    for a, b in zip(fast, plain, strict=True):
+        for s, values in enumerate(b.result.q([states, states], 2)):
+            # The table has all cells, the general way has those in the data.
+            assert np.allclose(a.probed_q[s][:5], values[:5], atol=1e-12)
 
 
 def test_an_action_never_tried_keeps_its_approximator():
-    first, second = stages(
-        [Corridor(), Corridor(prize=5.0)], iterations=3, new_data=(True, False)
+    tasks, batch = (
+        [Corridor(), Corridor(prize=5.0)],
+        SeedBatch((0,), Corridor().states()),
     )
-    team = SeedBatch((0,), Corridor().states())
-    *_, before = learn_stages([first], team)
-    (sets,) = before.learned.data
-    left, right = sets.by_action
+    first, second = stages(tasks, iterations=3, new_data=(True, False))
+    *_, before = learn_stages([first], batch)
+    (data,) = before.result.data
+    left, right = data.by_action
     starved = replace(left, rows=np.empty(0, np.intp))
-    data = [replace(sets, by_action=(starved, right))]
-    start = begin([warm_start], replace(before.learned, data=data))
-    *_, after = second.learner.learn(second, start, team)
+    data = [replace(data, by_action=(starved, right))]
+    start = begin([warm_start], replace(before.result, data=data))
+    *_, after = second.learner.learn(second, start, batch)
     assert np.array_equal(after.probed_q[0][:, 0], before.probed_q[0][:, 0])
     assert not np.array_equal(after.probed_q[0][:, 1], before.probed_q[0][:, 1])
 
@@ -114,7 +97,7 @@ def test_an_action_never_tried_keeps_its_approximator():
 def test_a_kept_dataset_is_not_collected_again():
     options = {"iterations": 2, "new_data": (True, False), "seeds": (0,)}
     snapshots = learn([Corridor()] * 2, warm_start, **options)
-    assert snapshots[0].learned.data is snapshots[-1].learned.data
+    assert snapshots[0].result.data is snapshots[-1].result.data
     assert [x.count for x in snapshots] == [1, 2, 3, 4]
 
 
@@ -129,27 +112,19 @@ class Recorder(Tabular):
         return super().fit(problems, keep, threads)
 
 
-def drawn(**options) -> np.ndarray:
-    """First draws of the fits, shape (iterations of both stages, seeds, actions)."""
-    recorder = Recorder()
-    learn([Corridor()] * 2, Boost(), regressor=recorder, iterations=3, **options)
-    return np.array(recorder.draws).reshape(6, 2, 2)
+@pytest.mark.parametrize("fixed", [False, True])
+def test_every_fit_has_randomness_of_its_own_unless_released(fixed):
+    recorder, tasks = Recorder(), [Corridor()] * 2
+    learn(tasks, Boost(), regressor=recorder, iterations=3, fixed_trees=fixed)
+    draws = np.array(recorder.draws).reshape(6, 2, 2)  # iterations, seeds, actions
+    assert len(np.unique(draws)) == (2 if fixed else 6 * 2 * 2)
+    assert all(len(np.unique(draws[:, s])) == (1 if fixed else 12) for s in (0, 1))
 
 
-def test_every_fit_has_randomness_of_its_own():
-    assert len(np.unique(drawn())) == 6 * 2 * 2
-
-
-def test_the_released_option_fixes_a_seeds_randomness_in_all_its_fits():
-    fixed = drawn(fixed_trees=True)
-    assert [len(np.unique(fixed[:, s])) for s in (0, 1)] == [1, 1]
-    assert len(np.unique(fixed)) == 2
-
-
-def test_the_released_option_shares_one_dataset_a_task():
+def test_the_released_option_shares_one_dataset_per_task():
     def counts(seeds, *transfers, **options):
         (last,) = learn([Corridor()], *transfers, seeds=seeds, iterations=1, **options)
-        return [x.multiplicity for x in last.learned.data]
+        return [x.multiplicity for x in last.result.data]
 
     own = counts((0, 1), warm_start)
     shared = counts((0, 1), warm_start, shared_data=True)

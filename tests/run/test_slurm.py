@@ -1,6 +1,6 @@
-"""A figure's sweep on a real Slurm: jobs warned, put back, killed, to the same bytes.
+"""A sweep on Slurm: jobs warned, requeued and killed, arrays that Slurm rejects.
 
-Without Slurm it is skipped, with BCRL_SLURM=1 it fails: CI installs what it needs.
+Without Slurm the tests on a real one are skipped; with BCRL_SLURM=1 they fail.
 """
 
 import json
@@ -15,16 +15,74 @@ from typing import Any
 
 import pytest
 
+from bcrl import cli
 from bcrl.config.plan import Plan
-from bcrl.run import runner
+from bcrl.run import launchers, runner
 from tests.conftest import plans
 from tests.run import cluster
 
 SMALL = ("scale=smoke", "scale.max_iterations=20", "checkpoint_every=0.01", "tag=x")
-SMALL += ("algorithm.regressor.trees=150",)  # seconds a job: time to disturb it
+SMALL += ("algorithm.regressor.trees=150",)  # a job takes seconds: time to disturb it
 SWEEP = ("experiment=fig2", *SMALL)
 PROGRAM = "import sys; from bcrl.cli import main; sys.argv[0] = 'bcrl'; main()"
-LIMIT = 120.0  # seconds in which anything waited for has to happen
+LIMIT = 120.0  # seconds in which anything waited for must happen
+
+
+# --- made-up commands instead of Slurm ---
+
+
+@pytest.fixture
+def made_up(tmp_path, monkeypatch):
+    """Commands of Slurm's, of which sbatch takes so many arrays and rejects others."""
+
+    def make(taken: int, squeue: str = "exit 0") -> None:
+        commands = {
+            "sbatch": f"echo >> calls; [ $(wc -l < calls) -le {taken} ] && "
+            "{ echo Submitted batch job 4711; exit; }; echo QOSMaxSubmit >&2; exit 1",
+            "squeue": squeue,
+            "srun": "exit 0",
+        }
+        for name, text in commands.items():
+            (tmp_path / name).write_text(f"#!/bin/bash\n{text}\n")
+            (tmp_path / name).chmod(0o755)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(launchers, "_ARRAY", 2)
+    words = "-m env=maze variant=BC scale=smoke seeds.count=3 hydra/launcher=slurm"
+    words += " hydra.launcher.seeds_per_job=1 progress=none"
+    monkeypatch.setattr(sys, "argv", ["bcrl", *words.split()])
+    return make
+
+
+@pytest.mark.parametrize(("taken", "code"), [(0, 2), (1, 3)])
+def test_the_arrays_before_a_rejected_one_are_named(made_up, taken, code, capsys):
+    made_up(taken)
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == code
+    text = capsys.readouterr().err
+    assert "QOSMaxSubmit" in text and ("scancel 4711" in text) == bool(taken)
+    assert "HYDRA_FULL_ERROR" not in text
+
+
+def test_without_slurm_its_launcher_is_rejected(made_up, monkeypatch, capsys):
+    monkeypatch.setenv("PATH", "/nonexistent")
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    assert "hydra/launcher=slurm: there is no sbatch" in capsys.readouterr().err
+
+
+def test_a_queue_that_never_answers_ends_the_waiting(made_up, monkeypatch):
+    made_up(9, squeue="echo slurm_load_jobs error >&2; exit 1")
+    monkeypatch.setattr(launchers, "_PATIENCE", 0.0)
+    with pytest.raises(launchers.Unattended, match=r"slurm_load_jobs error.*4711"):
+        launchers._wait(["4711"], True, launchers.Stop())
+    assert launchers.Unattended.exit_code == 3
+
+
+# --- a real Slurm ---
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +175,9 @@ def written(plans: list[Plan]) -> list[dict[str, bytes]]:
     ]
 
 
-def test_a_sweep_whose_jobs_are_disturbed_ends_in_the_same_bytes(slurm, tmp_path):
+@pytest.mark.slow
+@pytest.mark.slurm
+def test_a_sweep_whose_jobs_are_disturbed_ends_in_equal_files(slurm, tmp_path):
     sweep = Launched(slurm, tmp_path / "here", *SWEEP)
     warned = sweep.begun()
     sweep.warn(warned)  # as before a time limit
@@ -128,7 +188,7 @@ def test_a_sweep_whose_jobs_are_disturbed_ends_in_the_same_bytes(slurm, tmp_path
 
     code, said = sweep.end()
     assert code == 1 and "1 seed failed" in said, said
-    assert "begun, but its process is gone" in said and "Traceback" not in said
+    assert "begun, but its process died" in said and "Traceback" not in said
     assert [sweep.restarts(job) for job in (warned, failed, killed)] == [1, 1, 0]
     for job in (warned, failed):
         about = sweep.about(job)
@@ -146,7 +206,9 @@ def test_a_sweep_whose_jobs_are_disturbed_ends_in_the_same_bytes(slurm, tmp_path
     assert written(again.plans) == written(calm)
 
 
-def test_slurm_goes_on_without_the_command_until_it_is_told_to_stop(slurm, tmp_path):
+@pytest.mark.slow
+@pytest.mark.slurm
+def test_slurm_continues_without_the_command_until_scancel(slurm, tmp_path):
     long = (*SMALL[:-1], "algorithm.regressor.trees=2000")  # until it is cancelled
     sweep = Launched(slurm, tmp_path, "env=maze", "variant=BC", *long)
     sweep.process.terminate()

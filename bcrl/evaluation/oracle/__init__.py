@@ -8,18 +8,16 @@ import pkgutil
 from dataclasses import dataclass
 from types import ModuleType
 
-import numpy as np
-from numpy.typing import NDArray
-
 from bcrl.envs.base import Env
+from bcrl.learning import Floats
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
     """Q* of one task: `states` (n, d) and `q` (n, A); both arrays are read-only."""
 
-    states: NDArray[np.float64]
-    q: NDArray[np.float64]
+    states: Floats
+    q: Floats
 
     def __post_init__(self) -> None:
         self.states.setflags(write=False)
@@ -28,31 +26,32 @@ class Reference:
 
 @functools.cache
 def oracles() -> dict[str, ModuleType]:
-    """Modules of this package that know a Q*, by name.
+    """The oracles by name: modules of this package with an environment class `ENV`.
 
-    Such a module says by `ENV` of which environment, and has `reference` and `table`.
+    Each one has functions `reference` and `table`.
     """
-    found = (
-        (module.name, importlib.import_module(f"{__name__}.{module.name}"))
-        for module in pkgutil.iter_modules(__path__)
-        if not module.name.startswith("_")
-    )
-    return {name: module for name, module in found if hasattr(module, "ENV")}
+    names = [module.name for module in pkgutil.iter_modules(__path__)]
+    found = {
+        name: importlib.import_module(f"{__name__}.{name}")
+        for name in names
+        if not name.startswith("_")
+    }
+    return {name: module for name, module in found.items() if hasattr(module, "ENV")}
 
 
 def _of(env: Env) -> ModuleType | None:
-    """The oracle of `env`, not of whatever else has its name."""
+    """The oracle of exactly this class of environments."""
     found = (module for module in oracles().values() if type(env) is module.ENV)
     return next(found, None)
 
 
-def available(env: Env) -> bool:
+def has_oracle(env: Env) -> bool:
     """Whether an oracle knows `env`."""
     return _of(env) is not None
 
 
 @functools.lru_cache(maxsize=64)
 def reference(env: Env) -> Reference | None:
-    """Q* of `env` by the oracle that knows it, or None if there is none."""
+    """Q* of `env`; None without an oracle."""
     oracle = _of(env)
     return oracle.reference(env) if oracle else None

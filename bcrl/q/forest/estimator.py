@@ -31,15 +31,14 @@ from bcrl.q.forest.forest import (
 class ExtraTrees(RegressorMixin, BaseEstimator):
     """Extra-trees regression, `bcrl.q.forest` behind scikit-learn's interface.
 
-    Of `sklearn.ensemble.ExtraTreesRegressor` it has the parameters and attributes
-    below, with the same meaning and defaults (scikit-learn's max_features=1.0 tries
-    all, too); the trees are others, drawn from the same distribution. Weights must be
-    whole numbers: a row of weight 3 gives the same trees, to the bit, as three equal
-    rows. It lacks several outputs, missing values, sparse X, `min_samples_*` as
-    fractions, other criteria than the squared error, `max_leaf_nodes`,
-    `min_impurity_decrease`, `min_weight_fraction_leaf`, `ccp_alpha`, `monotonic_cst`,
-    `bootstrap` with `oob_score` and `max_samples`, `warm_start`, `verbose`, and access
-    to single trees (`estimators_`, `apply`, `decision_path`).
+    It has the parameters below of `sklearn.ensemble.ExtraTreesRegressor`, with the same
+    meaning and the same defaults (max_features=None is scikit-learn's 1.0). Its trees
+    differ, but have the same distribution. Weights must be whole numbers: a row of
+    weight 3 gives exactly the trees of three equal rows. Not supported: several
+    outputs, missing values, sparse X, fractional `min_samples_*`, other criteria than
+    the squared error, `max_leaf_nodes`, `min_impurity_decrease`, `ccp_alpha`,
+    `min_weight_fraction_leaf`, `monotonic_cst`, `bootstrap`, `oob_score`,
+    `max_samples`, `warm_start`, `verbose`, `estimators_`, `apply`, `decision_path`.
 
     Parameters
     ----------
@@ -63,7 +62,7 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
     forest_ : Forest
         The fitted trees.
     feature_importances_ : ndarray of shape (n_features_in_,)
-        Each feature's share of the variance that the splits take off (impurity-based).
+        Each feature's share of the variance that the splits remove (impurity-based).
     n_features_in_ : int
         Columns of X.
     """
@@ -114,37 +113,30 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
         counts = counts[counts > 0]
         random = check_random_state(self.random_state)
         seeds = random.randint(0, 2**64, size=trees, dtype=np.uint64)
-        settings = TreeSettings(
-            self.min_samples_split,
-            self.min_samples_leaf,
-            _features(self.max_features, X.shape[1]),
-            self.max_depth,
-        )
-        given = None if (counts == 1).all() else counts
-        parts = [
-            Regression(X, y, part, given)
-            for part in np.array_split(seeds, min(threads, trees))
-        ]
+        most = _n_features(self.max_features, X.shape[1])
+        limits = self.min_samples_split, self.min_samples_leaf, most, self.max_depth
+        parts = np.array_split(seeds, min(threads, trees))
+        tasks = [Regression(X, y, part, counts) for part in parts]
         try:
-            fits = fit_forests(parts, settings, threads=threads)
+            fits = fit_forests(tasks, TreeSettings(*limits), threads=threads)
         except BcrlError as error:
             raise ValueError(str(error)) from None
-        self.forest_ = join([fit.forest for fit in fits])
-        self._fitted_to = X, y, counts  # small beside the trees
+        self.forest_ = join([fit.forest for fit in fits if fit.forest is not None])
+        self._data: tuple[np.ndarray, ...] = X, y, counts  # small beside the trees
         return self
 
     @property
     def feature_importances_(self) -> np.ndarray:
-        """Each feature's share of the variance that the splits take off, (d,)."""
+        """Each feature's share of the variance that the splits remove, (d,)."""
         check_is_fitted(self)
-        return importances(self.forest_, *self._fitted_to)
+        return importances(self.forest_, *self._data)
 
     def predict(self, X: ArrayLike) -> np.ndarray:
         """Mean of the trees at X (n, d): (n,) float64."""
         check_is_fitted(self)
-        X = validate_data(self, X, dtype=np.float32, order="C", reset=False)
+        x: np.ndarray = validate_data(self, X, dtype=np.float32, order="C", reset=False)
         threads = self._threads()
-        parts = np.array_split(X, min(threads, len(X)))
+        parts = np.array_split(x, min(threads, len(x)))
         forests = [self.forest_] * len(parts)
         return np.concatenate(predict_forests(forests, parts, threads=threads))
 
@@ -158,8 +150,8 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
         return max(jobs if jobs > 0 else cores + 1 + jobs, 1)
 
 
-def _features(most: int | float | str | None, d: int) -> int | None:
-    """How many of d features `max_features` stands for; ValueError if for none."""
+def _n_features(most: int | float | str | None, d: int) -> int | None:
+    """How many of d features are tried per split; ValueError for a bad `most`."""
     if most is None:
         return None
     if isinstance(most, str) and most in ("sqrt", "log2"):
@@ -173,18 +165,18 @@ def _features(most: int | float | str | None, d: int) -> int | None:
 
 
 def _counts(X: np.ndarray, weights: ArrayLike | None) -> np.ndarray:
-    """How often each row counts (n,); ValueError unless whole numbers of at least 0."""
+    """How often each row counts, (n,) int64; ValueError for other weights."""
     try:
-        weights = _check_sample_weight(weights, X, dtype=np.float64)
+        counts: np.ndarray = _check_sample_weight(weights, X, dtype=np.float64)
     except ValueError as error:
         raise ValueError(f"sample_weight (multiplicity): {error}") from None
-    wrong = np.flatnonzero((weights < 0) | (weights != np.floor(weights)))
-    if len(wrong) or not weights.any():
-        place = wrong[0] if len(wrong) else 0
+    wrong = np.flatnonzero((counts < 0) | (counts != np.floor(counts)))
+    if len(wrong) or not counts.any():
+        row = wrong[0] if len(wrong) else 0
         raise ValueError(
-            f"sample_weight (multiplicity) of row {place} is {weights[place]}: must be "
-            "whole numbers of at least 0, not all of them 0; a row counts so many times"
+            f"sample_weight (multiplicity) of row {row} is {counts[row]}: must be a "
+            "whole number of at least 0, and not all may be 0; a row counts so often"
         )
-    if weights.sum() >= 2**40:
+    if counts.sum() >= 2**40:
         raise ValueError("sample_weight (multiplicity): the sum must stay below 2^40")
-    return weights.astype(np.int64)
+    return counts.astype(np.int64)

@@ -25,18 +25,17 @@ from itertools import pairwise
 import numpy as np
 
 from bcrl.errors import BcrlError, ConfigError
-from bcrl.q.compiled import grow_forest, predict_forest
+from bcrl.q.forest.grow import grow_forest
+from bcrl.q.forest.predict import predict_forest
 
-#: Stand-ins for what a regression leaves out.
-NO_COUNTS = np.empty(0, np.int64)
-UNLIMITED = 2**62
+_UNLIMITED = 2**62
 
 
 @dataclass(frozen=True)
 class TreeSettings:
-    """What scikit-learn calls by the same names.
+    """scikit-learn's parameters of the same names.
 
-    max_features None tries all, max_depth None is no limit.
+    max_features None: all features are tried; max_depth None: no limit.
     """
 
     min_samples_split: int = 2
@@ -63,9 +62,9 @@ class Regression:
 
 @dataclass(frozen=True)
 class Forest:
-    """The trees of a forest, packed one after the other: 16 bytes a node.
+    """The trees of a forest, packed one after the other: 16 bytes per node.
 
-    nodes: (N,) of `kernel.NODE`; values: (leaves,) float64; first: (T+1,) int64,
+    nodes: (N,) of `split.NODE`; values: (leaves,) float64; first: (T+1,) int64,
     where each tree begins; depths: (T,) int64, 0 for a tree that is a single leaf.
     """
 
@@ -87,7 +86,7 @@ class Forest:
 
 
 @dataclass
-class Fitted:
+class ForestFit:
     """A fitted forest, and its predictions at the training rows and at the queries.
 
     fitted: (n,) float64; queried: (m,) float64; both what `forest.predict` gives, bit
@@ -117,13 +116,13 @@ def join(forests: Sequence[Forest]) -> Forest:
 def importances(
     forest: Forest, x: np.ndarray, y: np.ndarray, multiplicity: np.ndarray
 ) -> np.ndarray:
-    """Each feature's share (d,) of the variance that the splits take off, or zeros.
+    """Each feature's share (d,) of the variance that the splits remove, or zeros.
 
     x (n, d) float32, y (n,), multiplicity (n,): what the forest was fitted to. The mean
     of the trees' shares, as scikit-learn defines it (Breiman et al. 1984).
     """
     bits = (x + np.float32(0.0)).view(np.int32)  # −0 is taken as +0
-    keys = bits ^ ((bits >> 31) & np.int32(2**31 - 1))  # `kernel.key_of`
+    keys = bits ^ ((bits >> 31) & np.int32(2**31 - 1))  # `split.key_of`
     y = y - np.average(y, weights=multiplicity)
     moments = multiplicity * np.stack([np.ones(len(y)), y, y * y])
     shares = np.zeros((len(forest.depths), x.shape[1]))
@@ -154,24 +153,22 @@ def fit_forests(
     *,
     threads: int = 1,
     keep: bool = True,
-) -> list[Fitted]:
+) -> list[ForestFit]:
     """Fit one forest per regression; neither `threads` nor the others change it.
 
     keep: whether the trees are stored; predictions come with each result either way.
     Raises ConfigError for settings, BcrlError for data that no forest can be fitted to.
     """
-    limits = _limits(settings)
+    min_split, min_leaf, most, deepest = _limits(settings)
     checked = [_checked(regression) for regression in regressions]
 
-    def fit(arguments: tuple[np.ndarray, ...]) -> Fitted:
+    def fit(arguments: tuple[np.ndarray, ...]) -> ForestFit:
         d = arguments[0].shape[1]
-        min_split, min_leaf, most, deepest = limits
-        numbers = (min_split, min_leaf, min(most, d), deepest)
-        nodes, values, first, depths, fitted, queried = grow_forest(
-            *arguments, numbers, keep
-        )
+        limits = (min_split, min_leaf, min(most, d), deepest)
+        *trees, fitted, queried = grow_forest(*arguments, limits, keep)
+        nodes, values, first, depths = trees
         forest = Forest(nodes, values, first, depths, d) if keep else None
-        return Fitted(forest, fitted, queried)
+        return ForestFit(forest, fitted, queried)
 
     return _spread(fit, checked, threads)
 
@@ -179,13 +176,13 @@ def fit_forests(
 def predict_forests(
     forests: Sequence[Forest], x: Sequence[np.ndarray], *, threads: int = 1
 ) -> list[np.ndarray]:
-    """What each forest predicts at its own `x`, (n, d): one (n,) float64 each."""
+    """The predictions (n,) float64 of each forest at its own x (n, d)."""
     pairs = list(zip(forests, x, strict=True))
     return _spread(lambda pair: pair[0].predict(pair[1]), pairs, threads)
 
 
 def _spread(function: Callable, items: Sequence, threads: int) -> list:
-    """`function` of every item in order, on up to `threads` threads."""
+    """The results of `function` for all items, on up to `threads` threads."""
     if threads < 1:
         raise ConfigError("threads", threads, "must be at least 1")
     threads = min(threads, len(items), 4 * (os.cpu_count() or 1))
@@ -196,12 +193,12 @@ def _spread(function: Callable, items: Sequence, threads: int) -> list:
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """One pool for all calls: small predictions would cost less than its threads."""
+    """One pool for all calls, because starting threads costs more than a small call."""
     return ThreadPoolExecutor(threads)
 
 
 def _limits(settings: TreeSettings) -> tuple[int, ...]:
-    """The settings as the compiled code takes them, checked."""
+    """The checked settings as the compiled code takes them."""
     found = []
     for name, least in (
         ("min_samples_split", 2),
@@ -211,7 +208,7 @@ def _limits(settings: TreeSettings) -> tuple[int, ...]:
     ):
         value = getattr(settings, name)
         if value is None and name.startswith("max"):
-            value = UNLIMITED
+            value = _UNLIMITED
         if not isinstance(value, int | np.integer) or value < least:
             raise ConfigError(name, value, f"must be an integer of at least {least}")
         found.append(int(value))
@@ -231,7 +228,7 @@ def _points(name: str, x: np.ndarray, d: int | None = None) -> np.ndarray:
 
 
 def _checked(regression: Regression) -> tuple[np.ndarray, ...]:
-    """x, y, multiplicity, tree seeds and queries as the compiled code takes them."""
+    """Checked x, y, multiplicity, tree seeds and queries for the compiled code."""
     x = _points("x", regression.x)
     y = np.ascontiguousarray(regression.y, np.float64)
     seeds = np.ascontiguousarray(regression.tree_seeds, np.uint64)
@@ -241,7 +238,7 @@ def _checked(regression: Regression) -> tuple[np.ndarray, ...]:
         raise BcrlError("y holds NaN or infinity")
     if seeds.ndim != 1 or len(seeds) < 1:
         raise BcrlError(f"tree_seeds has shape {seeds.shape}, expected one per tree")
-    counts = NO_COUNTS
+    counts = np.empty(0, np.int64)  # all rows count once
     if regression.multiplicity is not None:
         counts = np.ascontiguousarray(regression.multiplicity, np.int64)
         if counts.shape != y.shape or counts.min() < 1 or counts.sum() >= 2**40:

@@ -1,7 +1,7 @@
-"""Q-networks of S seeds side by side: stacked weights, batched products, Adam.
+"""Q-networks of S seeds side by side: stacked weights, batched products and Adam.
 
-What is here runs on any device. On a CPU `cpu` computes the same in compiled
-code; `DQN` and `DeepQ` choose.
+This module runs on any device. On a CPU, the module `cpu` computes the same faster, in
+compiled code; `DeepQ` and the DQN update choose by the device of the parameters.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ import torch
 from numpy.typing import NDArray
 
 from bcrl.common.serialization import DERIVED, storable
-from bcrl.q import compiled
 from bcrl.q.functions import Values, check_width, each
-from bcrl.q.networks.tiles import FADED
+from bcrl.q.networks import cpu
 
 Tensor = torch.Tensor
 
@@ -44,10 +43,10 @@ def xavier(
 @storable
 @dataclass(eq=False)
 class Networks:
-    """S perceptrons with ReLU, their parameters the rows of one buffer `flat` (S, P).
+    """S perceptrons with ReLUs, one per seed; no seed's result depends on the others.
 
-    `sizes` are the widths (in, hidden …, out). Batches have shape (S, n, in); nothing
-    is shared between seeds, and no result depends on how many there are.
+    sizes: the layers' widths (in, hidden …, out); flat: all parameters, (S, P). Inputs
+    have shape (S, n, in).
     """
 
     sizes: tuple[int, ...]
@@ -70,7 +69,7 @@ class Networks:
         return views
 
     def clone(self) -> Networks:
-        """Networks with the same parameters in a buffer of their own."""
+        """Networks with copies of the parameters."""
         return Networks(self.sizes, self.flat.clone())
 
     def forward(self, x: Tensor) -> Tensor:
@@ -88,9 +87,9 @@ class Networks:
         return x
 
     def backward(self, x: Tensor, slope: Tensor, gradient: Networks) -> None:
-        """Write the parameters' gradients into `gradient`, given ∂loss/∂output.
+        """Write ∂loss/∂parameters into `gradient`, given slope = ∂loss/∂output.
 
-        `slope` (S, n, out) belongs to the latest `forward(x)`, x (S, n, in).
+        `slope` (S, n, out) belongs to the latest `forward(x)` with x (S, n, in).
         """
         activations = self._buffers[x.shape[1]]
         spare = gradient._buffers.setdefault(
@@ -115,7 +114,7 @@ def _mask(slope: Tensor, activation: Tensor) -> None:
 @storable
 @dataclass(eq=False)
 class Adam:
-    """Adam on a flat buffer (S, P), every seed by itself (Kingma and Ba 2015)."""
+    """Adam on parameters (S, P), each seed by itself (Kingma and Ba 2015)."""
 
     moments: Tensor  # (2, S, P)
     rate: float
@@ -125,15 +124,15 @@ class Adam:
 
     @classmethod
     def of(cls, parameters: Tensor, rate: float) -> Adam:
-        """For parameters (S, P) that have not been trained yet."""
+        """For parameters (S, P) that have not been trained."""
         return cls(parameters.new_zeros((2, *parameters.shape)), rate)
 
     def clone(self) -> Adam:
-        """The same moments and step count in a buffer of their own."""
+        """The same step count and copies of the moments."""
         return replace(self, moments=self.moments.clone())
 
     def next_step(self) -> tuple[float, float, float, float, float]:
-        """Count a step; β1, β2, the rate and scale that correct the bias, and ε."""
+        """Count a step; returns β1, β2, bias-corrected rate and scale, and ε."""
         self.steps += 1
         b1, b2 = self.betas
         rate = self.rate / (1.0 - b1**self.steps)
@@ -146,15 +145,15 @@ class Adam:
         first, second = self.moments
         first.lerp_(gradient, 1.0 - b1)
         second.mul_(b2).addcmul_(gradient, gradient, value=1.0 - b2)
-        first.masked_fill_(first.abs() < FADED, 0.0)
-        second.masked_fill_(second < FADED, 0.0)
+        first.masked_fill_(first.abs() < cpu.FADED, 0.0)
+        second.masked_fill_(second < cpu.FADED, 0.0)
         parameters.addcdiv_(first, second.sqrt().mul_(scale).add_(eps), value=-rate)
 
 
 @storable
 @dataclass
 class DeepQ:
-    """What DQN has learned: the residual as a Q-function, and all it takes to go on."""
+    """The residual that DQN learns, as a Q-function, and all that training needs."""
 
     online: Networks
     target: Networks
@@ -165,29 +164,25 @@ class DeepQ:
         check_width(states, self.online.sizes[0])
         if isinstance(states, np.ndarray):
             return self._values(self.online, states)
-        return each(states, lambda s: self._one(s, states[s]))
-
-    def _one(self, s: int, x: NDArray) -> NDArray:
-        networks = Networks(self.online.sizes, self.online.flat[s : s + 1])
-        return self._values(networks, x[None])[0]
+        one = [
+            Networks(self.online.sizes, self.online.flat[s : s + 1])
+            for s in range(len(states))
+        ]
+        return each(states, lambda s: self._values(one[s], states[s][None])[0])
 
     def _values(self, networks: Networks, x: NDArray) -> NDArray[np.float64]:
-        """Values (S, n, A) at states (S, n, d)."""
+        """Values (S, n, A) at states x (S, n, d)."""
         flat, inputs = networks.flat, np.ascontiguousarray(x, np.float32)
         if flat.device.type == "cpu":
             sizes = np.array(networks.sizes)
-            return compiled.outputs(flat.numpy(), sizes, inputs).astype(np.float64)
+            return cpu.outputs(flat.numpy(), sizes, inputs).astype(np.float64)
         values = networks.forward(torch.from_numpy(inputs).to(flat.device))
         return values.cpu().numpy().astype(np.float64)
 
     def clone(self) -> DeepQ:
         """A copy that may be trained on without changing this one."""
-        return DeepQ(
-            self.online.clone(),
-            self.target.clone(),
-            self.optimiser.clone(),
-            self.steps,
-        )
+        online, target = self.online.clone(), self.target.clone()
+        return DeepQ(online, target, self.optimiser.clone(), self.steps)
 
     def copy_target(self) -> None:
         """The target becomes the online network."""

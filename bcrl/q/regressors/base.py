@@ -1,4 +1,4 @@
-"""A regression as fitted Q-iteration poses it, its fits, and a Q made of them."""
+"""The regression problems of fitted Q-iteration, their fits, and a Q made of fits."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from bcrl.q.functions import Values
 @storable
 @dataclass(frozen=True)
 class Problem:
-    """One regression (one seed and action), with the points its fit is asked at.
+    """The regression of one seed and action, with the points to predict at.
 
-    A fit depends on nothing else, so that a problem can be stored in a model's place.
+    A fit depends on nothing else, so a checkpoint stores the problem, not the model.
     """
 
     x: NDArray[np.float32]  # (n, d)
     y: NDArray[np.float64]  # (n,)
-    multiplicity: NDArray[np.int64]  # (n,) how many rows each row stands for
+    multiplicity: NDArray[np.int64]  # (n,): how many equal rows each row stands for
     queries: NDArray[np.float32]  # (m, d)
     seed: int
     path: tuple[int, ...]  # of the seed's stream "trees"
 
     @property
     def rng(self) -> np.random.Generator:
-        """The fit's own randomness, from its beginning."""
+        """The random stream of this fit, from its beginning."""
         return stream(self.seed, "trees", *self.path)
 
 
@@ -48,17 +48,17 @@ class Fit:
 
 
 class Regressor(Protocol):
-    """Fits many problems at once; constructor arguments are its YAML keys.
+    """Fits many problems at once; its constructor's arguments are its YAML keys.
 
-    `finite_only`: whether it needs an environment with finitely many states.
-    `pointwise`, if it says so: no prediction depends, to the last bit, on what else is
-    asked, so that it may be remembered.
+    finite_only: whether it needs an environment with finitely many states. A regressor
+    may also set `pointwise = True`: then no prediction depends, to the last bit, on the
+    other points of the call, and predictions may be cached.
     """
 
     finite_only: bool
 
     def fit(self, problems: Sequence[Problem], keep: bool, threads: int) -> list[Fit]:
-        """Fits, in order; `keep=False` says that no model will be asked again."""
+        """The fits, in order; with `keep=False` no model needs to predict again."""
 
     def predict(
         self, models: Sequence[Any], x: Sequence[NDArray], threads: int
@@ -69,36 +69,33 @@ class Regressor(Protocol):
 @storable
 @dataclass
 class Fitted:
-    """A model and what it was fitted to, from which it can be had again."""
+    """A model and the problem that it can be fitted to again."""
 
     problem: Problem  # without its queries
     model: Any = field(default=None, metadata=DERIVED)
 
     @classmethod
     def of(cls, problem: Problem, fit: Fit) -> Fitted:
-        """The model of a fit, for as long as it may be asked."""
+        """The model of a fit, without the fit's predictions."""
         return cls(replace(problem, queries=problem.queries[:0]), fit.model)
 
 
-Cell = tuple[int, int]  # seed, by place in its team, and action
+Cell = tuple[int, int]  # a seed's index in its batch, and an action
 
 
 def fit_each(
     regressor: Regressor, problems: Mapping[Cell, Problem], keep: bool, threads: int
 ) -> tuple[dict[Cell, Fit], dict[int, str]]:
-    """Fits of `problems`, and why seeds have none; those of the others are the same."""
+    """The fits of `problems`, and why seeds failed; a failure changes no other seed."""
 
     def fit(cells: list[Cell]) -> list[Fit]:
-        asked = [problems[cell] for cell in cells]
-        fits = regressor.fit(list(map(_copied, asked)), keep, threads)
-        for problem, found in zip(asked, fits, strict=True):
-            for values, x in (
-                (found.fitted, problem.x),
-                (found.queried, problem.queries),
-            ):
-                _check_shape(values, len(x))
-                if not np.isfinite(values).all():
-                    raise BcrlError("gave a prediction that is not finite")
+        own = [problems[cell] for cell in cells]
+        fits = regressor.fit(list(map(_copied, own)), keep, threads)
+        for problem, fit in zip(own, fits, strict=True):
+            _check_shape(fit.fitted, len(problem.x))
+            _check_shape(fit.queried, len(problem.queries))
+            if not (np.isfinite(fit.fitted).all() and np.isfinite(fit.queried).all()):
+                raise BcrlError("a prediction is not finite")
         return fits
 
     return _by_seed(regressor, "fit", fit, list(problems))
@@ -107,16 +104,17 @@ def fit_each(
 def _by_seed(
     regressor: Regressor, what: str, do: Callable[[list[Cell]], list], cells: list[Cell]
 ) -> tuple[dict[Cell, Any], dict[int, str]]:
-    """What `do(cells)` gives; where it raises, seed by seed, and why seeds failed."""
+    """The results of `do(cells)`, seed by seed if it raises, and why seeds failed."""
     try:
         return dict(zip(cells, do(cells), strict=True)), {}
-    except ConfigError:  # which concerns all seeds
+    except ConfigError:  # concerns all seeds
         raise
-    except Exception as error:  # whatever a regressor of the user's does
+    except Exception as error:  # a user's regressor may raise anything
         seeds = dict.fromkeys(s for s, _ in cells)
         if len(seeds) == 1:
             return {}, dict.fromkeys(seeds, _reason(regressor, what, error))
-    found, failed = {}, {}
+    found: dict[Cell, Any] = {}
+    failed: dict[int, str] = {}
     for seed in seeds:
         own = [cell for cell in cells if cell[0] == seed]
         some, lost = _by_seed(regressor, what, do, own)
@@ -125,7 +123,7 @@ def _by_seed(
 
 
 def _copied(problem: Problem) -> Problem:
-    """The same problem in arrays of its own, which a regressor may change."""
+    """The problem in copies of its arrays, because a regressor may change them."""
     arrays = ("x", "y", "multiplicity", "queries")
     return replace(problem, **{name: getattr(problem, name).copy() for name in arrays})
 
@@ -133,12 +131,12 @@ def _copied(problem: Problem) -> Problem:
 def _check_shape(values: Any, n: int) -> None:
     """Raise BcrlError unless there are n predictions."""
     if np.shape(values) != (n,):
-        text = f"gave predictions of shape {np.shape(values)}, expected ({n},)"
-        raise BcrlError(text)
+        shape = np.shape(values)
+        raise BcrlError(f"predictions have the shape {shape}, expected ({n},)")
 
 
 def _reason(regressor: Regressor, what: str, error: Exception) -> str:
-    """Which regressor failed, how, and where in the code unless we said so."""
+    """Which regressor failed and why; for a foreign error also where in the code."""
     text = " ".join(str(error).split())
     if not isinstance(error, BcrlError):
         place = traceback.extract_tb(error.__traceback__)[-1]
@@ -151,15 +149,17 @@ def _reason(regressor: Regressor, what: str, error: Exception) -> str:
 
 
 class Threads(Protocol):
-    """Whoever says how many threads predictions may take."""
+    """An object with the number of threads that predictions may use."""
 
-    threads: int
+    @property
+    def threads(self) -> int:
+        """The number of threads."""
 
 
 @storable
 @dataclass(frozen=True)
 class FittedQ:
-    """Q as one model per seed and action; an action never seen predicts 0 (None)."""
+    """Q as one model per seed and action; an unseen action (None) has the value 0."""
 
     models: Sequence[Sequence[Fitted | None]]
     regressor: Regressor
@@ -167,22 +167,22 @@ class FittedQ:
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         self._restore()
-        cells = [
-            (s, a)
+        models = {
+            (s, a): fitted.model
             for s, row in enumerate(self.models)
             for a, fitted in enumerate(row)
             if fitted is not None and len(states[s])
-        ]
+        }
 
         def predict(cells: list[Cell]) -> list[NDArray[np.float64]]:
-            models = [self.models[s][a].model for s, a in cells]
-            asked = [states[s].copy() for s, _ in cells]  # which it may change
-            found = self.regressor.predict(models, asked, self.team.threads)
-            for x, values in zip(asked, found, strict=True):
+            own = [models[cell] for cell in cells]
+            points = [states[s].copy() for s, _ in cells]  # it may change them
+            found = self.regressor.predict(own, points, self.team.threads)
+            for x, values in zip(points, found, strict=True):
                 _check_shape(values, len(x))
             return found
 
-        found, failed = _by_seed(self.regressor, "predict", predict, cells)
+        found, failed = _by_seed(self.regressor, "predict", predict, list(models))
         if failed:
             raise LostSeeds(failed)
         out = [np.zeros((len(x), n_actions)) for x in states]
@@ -191,12 +191,10 @@ class FittedQ:
         return np.stack(out) if isinstance(states, np.ndarray) else out
 
     def _restore(self) -> None:
-        """Fit once more what came out of a checkpoint without its model."""
+        """Fit again the models that a checkpoint left out."""
         lost = [f for row in self.models for f in row if f and f.model is None]
         if lost:
-            problems = [fitted.problem for fitted in lost]
-            fits = self.regressor.fit(
-                list(map(_copied, problems)), True, self.team.threads
-            )
+            problems = [_copied(fitted.problem) for fitted in lost]
+            fits = self.regressor.fit(problems, True, self.team.threads)
             for fitted, fit in zip(lost, fits, strict=True):
                 fitted.model = fit.model

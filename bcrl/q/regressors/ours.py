@@ -1,4 +1,4 @@
-"""The regressors of fitted Q-iteration that can be chosen."""
+"""Our own regressors, and all regressors of fitted Q-iteration by name."""
 
 from __future__ import annotations
 
@@ -10,40 +10,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.common import plugins
-from bcrl.errors import ConfigError, at_least, did_you_mean
+from bcrl.errors import ConfigError, did_you_mean
 from bcrl.q.forest import forest
 from bcrl.q.regressors.base import Fit, Problem
-from bcrl.q.regressors.scikit import Sklearn, SklearnForest
+from bcrl.q.regressors.scikit import Sklearn, SklearnForest, TreeKeys
 
 
 @dataclass(frozen=True)
-class ForestRegressor:
+class ForestRegressor(TreeKeys):
     """Extremely randomised trees, compiled (Geurts et al. 2006; Ernst et al. 2005)."""
 
-    trees: int = 50
-    min_samples_split: int = 5
-    min_samples_leaf: int = 2
     finite_only = False
     pointwise = True
 
-    def __post_init__(self) -> None:
-        at_least("algorithm.regressor.trees", self.trees, 1)
-        at_least("algorithm.regressor.min_samples_split", self.min_samples_split, 2)
-        at_least("algorithm.regressor.min_samples_leaf", self.min_samples_leaf, 1)
-
     def fit(self, problems: Sequence[Problem], keep: bool, threads: int) -> list[Fit]:
         settings = forest.TreeSettings(self.min_samples_split, self.min_samples_leaf)
-        jobs = [
-            forest.Regression(
-                p.x,
-                p.y,
-                p.rng.integers(2**64, size=self.trees, dtype=np.uint64),
-                None if (p.multiplicity == 1).all() else p.multiplicity,
-                p.queries,
-            )
-            for p in problems
-        ]
-        fits = forest.fit_forests(jobs, settings, threads=threads, keep=keep)
+        tasks = []
+        for p in problems:
+            seeds = p.rng.integers(2**64, size=self.trees, dtype=np.uint64)
+            counts = None if (p.multiplicity == 1).all() else p.multiplicity
+            tasks.append(forest.Regression(p.x, p.y, seeds, counts, p.queries))
+        fits = forest.fit_forests(tasks, settings, threads=threads, keep=keep)
         return [Fit(f.forest, f.fitted, f.queried) for f in fits]
 
     def predict(
@@ -54,7 +41,7 @@ class ForestRegressor:
 
 @dataclass(frozen=True)
 class Tabular:
-    """The exact regressor: the mean target of each point, 0 where none was seen."""
+    """The exact regressor: the mean target of each point, and 0 at unseen points."""
 
     finite_only = True
 
@@ -71,7 +58,7 @@ class Tabular:
     def predict(
         self, models: Sequence[Any], x: Sequence[NDArray], threads: int
     ) -> list[NDArray[np.float64]]:
-        raise NotImplementedError("a table is only asked at its own points")
+        raise NotImplementedError("a table has values at its own points only")
 
 
 REGRESSORS = {
@@ -83,9 +70,10 @@ REGRESSORS = {
 
 
 def regressor_class(name: str) -> type:
-    """The regressor class called `name` in `algorithm.regressor.name`.
+    """The regressor class for the config key `algorithm.regressor.name`.
 
-    A name with a dot, `package.module.Class`, is the user's own, as BCRL_TRUST allows.
+    A name with dots, `package.module.Class`, is a user's class; ConfigError otherwise
+    for a name that is unknown.
     """
     if "." in name:
         return plugins.component("algorithm.regressor.name", name, name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,20 +17,23 @@ from threadpoolctl import threadpool_limits
 from bcrl.errors import ConfigError, at_least, did_you_mean
 from bcrl.q.regressors.base import Fit, Problem
 
-#: Where scikit-learn keeps regressors that take plain values.
+#: Modules of scikit-learn whose regressors take plain values as arguments.
 MODULES = (
     *("dummy", "ensemble", "gaussian_process", "isotonic", "kernel_ridge"),
     *("linear_model", "neighbors", "neural_network", "svm", "tree"),
 )
 
 
-class _Fitting:
+class _Fitting(ABC):
     """Fits a `_model(seed)` to each problem; multiplicities become repeated rows."""
 
     finite_only = False
 
+    @abstractmethod
+    def _model(self, seed: int) -> Any: ...
+
     def fit(self, problems: Sequence[Problem], keep: bool, threads: int) -> list[Fit]:
-        """Fits, in order, each with a seed of its own."""
+        """The fits, in order, each with its own random seed."""
         seeds = [int(p.rng.integers(2**31)) for p in problems]
         with threadpool_limits(1):  # sums would depend on the number of threads
             return list(map(self._fit_one, problems, seeds))
@@ -39,22 +43,23 @@ class _Fitting:
         repeat = np.repeat(np.arange(len(problem.y)), problem.multiplicity)
         model.fit(problem.x[repeat], problem.y[repeat])
         both = model.predict(np.concatenate([problem.x, problem.queries]))
-        return Fit(model, *np.split(np.float64(both), [len(problem.y)]))
+        return Fit(model, *np.split(np.asarray(both, np.float64), [len(problem.y)]))
 
     def predict(
         self, models: Sequence[Any], x: Sequence[NDArray], threads: int
     ) -> list[NDArray[np.float64]]:
         """Each model's predictions (n,) at its own points (n, d)."""
         with threadpool_limits(1):
-            return [np.float64(m.predict(p)) for m, p in zip(models, x, strict=True)]
+            found = [m.predict(points) for m, points in zip(models, x, strict=True)]
+        return [np.asarray(values, np.float64) for values in found]
 
 
 @dataclass(frozen=True)
 class Sklearn(_Fitting):
-    """Any regressor of scikit-learn, by its class's name and arguments.
+    """Any regressor of scikit-learn, by the name of its class and its arguments.
 
-    In Python an estimator itself will do, a pipeline too. `standardise` puts a
-    StandardScaler before it. Whatever takes a `random_state` gets one a fit. Raises
+    From Python, `estimator` may also be an estimator or a pipeline. `standardise` puts
+    a StandardScaler before it. Each `random_state` gets a new value per fit. Raises
     ConfigError for a name or an argument that scikit-learn doesn't know.
     """
 
@@ -93,8 +98,8 @@ class Sklearn(_Fitting):
 
 
 @dataclass(frozen=True)
-class SklearnForest(_Fitting):
-    """scikit-learn's own extremely randomised trees: the judge of ours."""
+class TreeKeys:
+    """The YAML keys of both forests, with the paper's values."""
 
     trees: int = 50
     min_samples_split: int = 5
@@ -105,15 +110,17 @@ class SklearnForest(_Fitting):
         at_least("algorithm.regressor.min_samples_split", self.min_samples_split, 2)
         at_least("algorithm.regressor.min_samples_leaf", self.min_samples_leaf, 1)
 
+
+@dataclass(frozen=True)
+class SklearnForest(TreeKeys, _Fitting):
+    """scikit-learn's own extremely randomised trees, to compare ours with."""
+
     def _model(self, seed: int) -> Any:
         from sklearn.ensemble import ExtraTreesRegressor
 
-        return ExtraTreesRegressor(
-            n_estimators=self.trees,
-            min_samples_split=self.min_samples_split,
-            min_samples_leaf=self.min_samples_leaf,
-            random_state=seed,
-        )
+        leaf, split = self.min_samples_leaf, self.min_samples_split
+        keys = {"min_samples_leaf": leaf, "min_samples_split": split}
+        return ExtraTreesRegressor(self.trees, random_state=seed, **keys)
 
 
 def _class(name: str) -> type:
@@ -128,7 +135,7 @@ def _class(name: str) -> type:
 
 @functools.cache
 def _regressors() -> dict[str, type]:
-    """Those that can be made without an argument, by name."""
+    """The regressors that can be made without arguments, by name."""
     from sklearn.base import RegressorMixin
 
     return {

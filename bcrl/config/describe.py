@@ -1,0 +1,159 @@
+"""What each config key does: default, unit and allowed values, read from conf/.
+
+A key's comment is a sentence, then `Unit: ….` and `Allowed: ….` where they apply; it
+ends with a full stop. The comment at the top of a file describes the option.
+"""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from dataclasses import dataclass, field
+from typing import Any
+
+import yaml
+
+from bcrl.common.identity import flat
+from bcrl.config.hydra_compose import CONF
+from bcrl.errors import BcrlError
+
+#: The groups whose options bring keys.
+GROUPS = (
+    *("env", "algorithm", "algorithm/regressor", "curriculum", "boosting", "transfer"),
+    *("scale", "logger", "hydra/launcher"),
+)
+#: The groups whose options only choose or change what other groups bring.
+SHORTHANDS = ("variant", "experiment", "debug")
+KEY = re.compile(r"( *)([\w.]+):(?:\s|$)")
+COMMENT = re.compile(r"(?:^|\s)#\s*(.*)$")
+PARTS = re.compile(r"(.*?)(?:\s*Unit: (.*?)\.(?=\s|$))?(?:\s*Allowed: (.*)\.)?$")
+
+
+@dataclass
+class Entry:
+    """A key with one meaning; it has several entries if options differ on it."""
+
+    group: str
+    key: str
+    comment: str
+    defaults: dict[str, Any] = field(default_factory=dict)  # option → value
+
+    @property
+    def parts(self) -> tuple[str, str, str]:
+        """What the key does, its unit and the allowed values."""
+        text, unit, allowed = PARTS.fullmatch(self.comment).groups("")  # type: ignore
+        return text, unit, allowed
+
+    @property
+    def default(self) -> str:
+        """The default, or each default with its options."""
+        options: dict[str, list[str]] = {}
+        for option, value in self.defaults.items():
+            options.setdefault(_shown(value), []).append(option)
+        if len(options) == 1:
+            return next(iter(options))
+        return "; ".join(f"{value} ({', '.join(of)})" for value, of in options.items())
+
+
+def entries() -> list[Entry]:
+    """All keys that a user can set, by group."""
+    found = [e for group in ("", *GROUPS) for e in _of_group(group)]
+    for path in sorted(CONF.glob("budget/*.yaml")):
+        env, _, algorithm = path.stem.rpartition("_")
+        values = yaml.safe_load(path.read_text("utf-8"))
+        for entry in (e for e in found if e.group == "algorithm"):
+            name = entry.key.removeprefix("algorithm.")
+            if algorithm in entry.defaults and name in values:
+                entry.defaults[f"env={env}"] = values[name]
+    return found
+
+
+def options(group: str) -> dict[str, str]:
+    """The options of a group, each with the comment that its file begins with."""
+    found = {}
+    for path in sorted(CONF.glob(f"{group}/*.yaml")):
+        top = re.match(r"(?:#.*\n)*", path.read_text("utf-8"))[0]  # type: ignore
+        lines = [x.lstrip("# ") for x in top.splitlines() if "@package" not in x]
+        found[path.stem] = " ".join(lines)
+    return found
+
+
+def describe(word: str) -> str:
+    """What a key does, or a list: a group's options, the keys below, all keys for "".
+
+    Raises BcrlError for an unknown key.
+    """
+    key, known = word.partition("=")[0], entries()
+    if chosen := [entry for entry in known if entry.key == key]:
+        return "\n".join([key, *(_block(entry, len(chosen) > 1) for entry in chosen)])
+    prefix = f"{key.replace('/', '.')}." if key else ""
+    listed = options(key) if key in (*GROUPS, *SHORTHANDS) else {}
+    listed = {f"{key}={option}": text for option, text in listed.items()}
+    for entry in (e for e in known if e.key.startswith(prefix)):
+        listed.setdefault(entry.key, entry.parts[0].partition(". ")[0])
+    if listed:
+        return "\n".join(f"{name}: {text.rstrip('.')}" for name, text in listed.items())
+    from bcrl.config.hints import Hints  # composes a config, which takes a while
+
+    near = re.search(r"([\w./]+)=[^ ]*\?$", Hints(()).mean(key, ""))
+    hint = f"did you mean {near[1]}?" if near else "bcrl --describe lists all keys"
+    raise BcrlError(f"--describe {key}: unknown key; {hint}")
+
+
+def _block(entry: Entry, several: bool) -> str:
+    text, unit, allowed = entry.parts
+    facts = [f"With {entry.group}={', '.join(entry.defaults)}:"] * several
+    facts += [text, f"Default: {entry.default}."]
+    facts += [f"Unit: {unit}."] * bool(unit) + [f"Allowed: {allowed}."] * bool(allowed)
+    wrapped = (textwrap.fill(f"  {x}", 88, subsequent_indent="    ") for x in facts)
+    return "\n".join(wrapped)
+
+
+def _of_group(group: str) -> list[Entry]:
+    """A group's entries; a key without a comment joins the first entry of its name."""
+    found: list[Entry] = []
+    files = sorted(CONF.glob(f"{group}/*.yaml" if group else "config.yaml"))
+    texts = {path.stem: path.read_text("utf-8") for path in files}
+    prefix = f"{group.replace('/', '.')}." if group else ""
+    for described in (True, False):
+        for option, text in texts.items():
+            at_top = not group or "@package _global_" in text
+            comments, skipped = _comments(text), {"defaults", "_target_", "hydra"}
+            values = yaml.safe_load(text) or {}
+            for name, value in flat(values).items():
+                key, comment = f"{'' if at_top else prefix}{name}", comments.get(name)
+                if name.split(".")[0] in skipped or not key.startswith(prefix):
+                    continue
+                if bool(comment) != described:
+                    continue
+                of_key = [entry for entry in found if entry.key == key]
+                same = [e for e in of_key if comment in (None, e.comment)]
+                if not same:
+                    found += (same := [Entry(group, key, comment or "")])
+                same[0].defaults[option] = value
+    return found
+
+
+def _comments(text: str) -> dict[str, str]:
+    """Dotted key → its comment: beside it and on the lines below, or else above it."""
+    found: dict[str, str] = {}
+    stack: list[tuple[int, str]] = []
+    name, above = "", ""
+    for line in text.splitlines():
+        comment = COMMENT.search(line)
+        if key := KEY.match(line):
+            stack = [x for x in stack if x[0] < len(key[1])] + [(len(key[1]), key[2])]
+            name = ".".join(part for _, part in stack)
+            found[name], above = comment[1] if comment else above, ""
+        elif comment and re.match(r"\s+#", line):
+            if found.get(name):
+                found[name] += f" {comment[1]}"
+            else:
+                above = f"{above} {comment[1]}".strip()
+    return {name: text for name, text in found.items() if text.endswith(".")}
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, str):
+        return "required" if value == "???" else value
+    return yaml.safe_dump(value, default_flow_style=True, width=10**6).split("\n")[0]

@@ -1,0 +1,1 @@
+"""The paper's figures, and learning curves of any other environment."""

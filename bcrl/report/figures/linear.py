@@ -1,0 +1,194 @@
+"""Figure 4 of the paper: the linear system's learning curves, priors and target."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Rectangle
+from numpy.typing import NDArray
+
+from bcrl.report.figures import style
+from bcrl.report.figures.curves import draw_metric
+from bcrl.report.late import (
+    LEARNER_NAMES,
+    LINEAR,
+    pretraining,
+    pretraining_rows,
+    switches,
+    target_rows,
+)
+from bcrl.report.variants import Methods, Runs, Variant
+from bcrl.results.read import bad_file
+
+_WORST = -150.0  # target return of a policy that never succeeds: −1 in 150 steps
+_SHOWN_SEED = {"lspi": 0, "dqn": 10}  # whose Q the paper's Figure 4b shows
+_SOURCES = {"lspi": "LSPI", "dqn": "C-DQN"}  # learner → whose colour it has
+_APART = 0.18  # share of the axis below which neighbouring labels take two rows
+_EVERY = 4  # grid points per arrow
+_SMALL = {"fontsize": 6.5, "color": "0.35", "textcoords": "offset points"}
+NO_RUNS = {"ha": "center", "va": "center", "color": "0.5"}
+
+
+def _draw_target(axes: Axes, methods: Methods) -> None:
+    axes.axhline(_WORST, color="0.6", linewidth=0.6)
+    place = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "top"}
+    axes.annotate("never succeeding", (1.0, _WORST), (0, -2), **place, **_SMALL)
+    draw_metric(axes, methods, "return", target_rows)
+    end = max(int(variant.index[-1]) for variant in methods.values())
+    axes.set_xlim(0, 1.03 * end)
+    bottom, top = axes.get_ylim()
+    axes.set_ylim(bottom=min(bottom, _WORST - 0.07 * (top - _WORST)))  # room for a word
+    previous = -np.inf
+    place = {"xycoords": ("data", "axes fraction"), "ha": "left", "va": "bottom"}
+    for (learner, step), label in sorted(
+        switches(methods).items(), key=lambda item: item[0][1]
+    ):
+        colour = style.colour(_SOURCES[learner]) if learner in _SOURCES else "0.5"
+        axes.axvline(step, color=colour, linestyle=":")
+        raised = 10 if step - previous < _APART * end else 2
+        axes.annotate(label, (step, 1.0), (0, raised), **place, **_SMALL)
+        previous = step
+    axes.set_ylabel("return in the target task (undiscounted)")
+
+
+def _draw_pretraining(axes: Axes, methods: Methods) -> None:
+    handles = []
+    for learner, variant in pretraining(methods).items():
+        source, n = _SOURCES[learner], len(variant.seeds)
+        shown = {source: variant}
+        draw_metric(axes, shown, "discounted_return", pretraining_rows)
+        label = f"{LEARNER_NAMES[learner]}, {n} seed{'s' * (n != 1)}"
+        line = {"color": style.colour(source), "linewidth": 2, "label": label}
+        handles.append(Line2D([], [], **line))
+    if handles:
+        axes.legend(handles=handles, loc="lower right", fontsize=7)
+    else:
+        axes.text(0.5, 0.5, "no pretraining", transform=axes.transAxes, **NO_RUNS)
+    axes.set_ylabel("discounted return in the LQ task")
+    axes.set_title("pretraining", pad=3)
+
+
+def figure_4a(runs: Runs, tag: str | None = None) -> Figure:
+    """Linear system: return against environment steps, and the pretraining's own.
+
+    Mean ± 2 standard errors over seeds, under the exploring policy (paper, Fig. 4a).
+    """
+    methods = runs.compared(LINEAR, tag, "DQN")
+    figure = Figure(figsize=(1.3 * style.TEXT_WIDTH, 3.5))
+    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
+    _draw_target(left, methods)
+    _draw_pretraining(right, methods)
+    for axes in (left, right):
+        axes.set_xlabel("environment steps, pretraining included")
+        axes.xaxis.set_major_formatter(lambda x, _: f"{x:,.0f}".replace(",", "\u2009"))
+        axes.locator_params(axis="x", nbins=6)
+    style.legend(figure, methods)
+    what = "mean ± 2 standard errors over seeds, exploring policy; dotted: new task"
+    style.footer(figure, runs, methods, what)
+    return figure
+
+
+def prior(variant: Variant, seed: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """The first stage's Q of a seed on the x–y plane at zero velocity.
+
+    Axes x (X,), y (Y,), value max_a Q (X, Y) and the greedy action's force (X, Y, 2).
+    Raises BcrlError if the states are no whole x-major grid or the shapes disagree.
+    """
+    states, q, actions = variant.arrays(seed, "states", "q_stages", "actions")
+    if q.ndim != 3 or q.shape[1:] != (len(states), len(actions)) or not len(q):
+        raise bad_file(variant.npz(seed), f"has a q_stages of shape {q.shape}")
+    x, y = axes_of_grid(variant, seed, states[:, [0, 2]])  # state order x, ẋ, y, ẏ
+    force = actions[q[0].argmax(axis=1)]
+    return x, y, q[0].max(axis=1).reshape(len(x), -1), force.reshape(len(x), -1, 2)
+
+
+def axes_of_grid(
+    variant: Variant, seed: int, points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """x (X,) and y (Y,) of points (X · Y, 2); BcrlError unless the grid is x-major."""
+    x, y = np.unique(points[:, 0]), np.unique(points[:, 1])
+    grid = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
+    if grid.shape != points.shape or not np.allclose(grid, points):
+        raise bad_file(variant.npz(seed), "has states that are no grid")
+    return x, y
+
+
+def _draw_prior(axes: Axes, learner: str, variant: Variant | None) -> None:
+    axes.set(xlabel="position x", ylabel="position y", aspect="equal")
+    name = LEARNER_NAMES[learner].removesuffix(" on LQ")
+    title = rf"{name}: max$_a$ Q in the LQ task"
+    if variant is None:
+        axes.set_title(title, pad=4)
+        axes.set(xlim=(-5, 5), ylim=(-5, 5))
+        axes.text(0, 0, "no runs", **NO_RUNS)
+        return
+    wished = _SHOWN_SEED[learner]
+    seed = wished if wished in variant.seeds else min(variant.seeds)
+    x, y, value, force = prior(variant, seed)
+    image = axes.pcolormesh(x, y, value.T, cmap="viridis", rasterized=True)
+    at = slice(None, None, _EVERY)
+    fx, fy = force[at, at, 0].T, force[at, at, 1].T
+    look = {"color": "white", "edgecolor": "black", "linewidth": 0.4}
+    axes.quiver(x[at], y[at], fx, fy, pivot="middle", scale=16, width=0.009, **look)
+    axes.set_title(f"{title}, seed {seed}", pad=4)
+    style.colour_bar(axes, image, shrink=0.75, aspect=16)
+
+
+def _draw_environment(axes: Axes, variant: Variant) -> None:
+    """The target: strip, walls, goal, start region and drift."""
+    seed, names = min(variant.seeds), ("pathway", "goal", "start", "drift")
+    pathway, goal, start, drift = arrays = variant.arrays(seed, *names)
+    shapes = [np.shape(array) for array in arrays]
+    if shapes != [(4,), (3,), (4,), (2,)]:
+        raise bad_file(variant.npz(seed), f"describes its target in shapes {shapes}")
+    x0, y0, x1, y1 = pathway
+    length, margin = x1 - x0, 0.08 * (x1 - x0)
+    axes.set(xlabel="position x", ylabel="position y", aspect="equal")
+    axes.set(xlim=(x0 - margin, x1 + margin), ylim=(y0 - length / 3, y1 + length / 3))
+    axes.set_title("target task", pad=4)
+    axes.set_facecolor("0.88")
+    strip = {"facecolor": "white", "edgecolor": "none"}
+    axes.add_patch(Rectangle((x0, y0), length, y1 - y0, **strip))
+    axes.hlines([y0, y1], x0, x1, color="0.5", linewidth=0.8, linestyle=(0, (3, 2)))
+    axes.vlines([x0, x1], *axes.get_ylim(), color="black", linewidth=2.2)
+    place = {"facecolor": style.colour("B"), "edgecolor": "black"}
+    axes.add_patch(Circle(goal[:2], goal[2], **place))
+    region = {"facecolor": style.colour("SC"), "edgecolor": style.colour("DQN")}
+    size = start[2:] - start[:2]
+    axes.add_patch(Rectangle(start[:2], *size, linewidth=2, zorder=3, **region))
+    small = {"fontsize": 6.5, "xycoords": "data", "textcoords": "offset points"}
+    above = small | {"va": "bottom", "ha": "center"}
+    below = small | {"va": "top"}
+    middle, speed, top = (x0 + x1) / 2, float(np.hypot(*drift)), axes.get_ylim()[1]
+    if speed > 0:
+        axes.quiver(middle, (y0 + y1) / 2, *(drift / speed), scale=6, width=0.012)
+        axes.annotate(f"drift {speed:g}", (middle, y1), (0, 2), **above)
+    axes.annotate("goal", (goal[0], y1), (0, 2), **above)
+    axes.annotate("start", ((start[0] + start[2]) / 2, y1), (0, 2), **above)
+    off = "off the pathway: back to the start"
+    axes.annotate(off, (middle, y0), (0, -6), ha="center", **below)
+    for x, where, shift in ((x0, "left", 4), (x1, "right", -4)):
+        axes.annotate("wall, reflecting", (x, top), (shift, -3), ha=where, **below)
+
+
+def figure_4b(runs: Runs, tag: str | None = None) -> Figure:
+    """Linear system: both priors' values and greedy actions, and the target task.
+
+    LSPI's and DQN's LQ Q-functions on the plane of positions at zero velocity, each
+    with its own colour scale (paper, Fig. 4b).
+    """
+    methods = runs.compared(LINEAR, tag, "DQN")
+    found = pretraining(methods)
+    figure = Figure(figsize=(1.45 * style.TEXT_WIDTH, 3.8))  # widths decide
+    panels = figure.subplots(1, 3, width_ratios=(1.15, 1.15, 1))
+    for axes, learner in zip(panels, LEARNER_NAMES, strict=False):
+        _draw_prior(axes, learner, found.get(learner))
+    variant = next(iter(methods.values()))
+    _draw_environment(panels[2], variant)
+    shown = {v.method: v for v in found.values()} or {variant.method: variant}
+    what = "one seed per panel, own colour scales; "
+    what += "arrows: greedy action at zero velocity"
+    style.footer(figure, runs, shown, what, compares=False)
+    return figure

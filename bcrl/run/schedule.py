@@ -1,0 +1,85 @@
+"""The jobs that remain of plans: which seeds train together, and in which order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bcrl.config.plan import Plan
+from bcrl.errors import BcrlError
+from bcrl.run import checkpoints, costs, records
+
+#: By a plan's directory: its seeds that failed, and why.
+Failures = dict[Path, dict[int, str]]
+
+
+@dataclass(frozen=True)
+class Job:
+    """Seeds of a plan that train together as far as no other process has them."""
+
+    plan: Plan
+    seeds: tuple[int, ...]
+    done: float = 0.0  # share of the run that its checkpoint has
+    threads: int = 1
+    origin: Mapping[str, Any] = field(default_factory=dict)  # `origin.run_origin`
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of one core that the whole job is expected to take."""
+        return costs.expected(self.plan) * len(self.seeds)
+
+
+def merged(plans: Sequence[Plan]) -> list[Plan]:
+    """The plans, those of one directory as one with the seeds of all."""
+    together: dict[Path, Plan] = {}
+    for plan in plans:
+        before = together.get(plan.directory, plan)
+        commands = dict.fromkeys([*before.command.splitlines(), plan.command])
+        together[plan.directory] = replace(
+            before,
+            asked=tuple(dict.fromkeys(before.asked + plan.asked)),
+            seeds=tuple(dict.fromkeys(before.seeds + plan.seeds)),
+            command="\n".join(commands),
+        )
+    return list(together.values())
+
+
+def ordered(plans: Sequence[Plan], failed: Failures) -> list[Job]:
+    """The jobs that remain, the one expected to be longest first.
+
+    A batch with a checkpoint resumes as it was. Seeds that `failed` are left out; those
+    whose checkpoint can't be read are added there.
+    """
+    pending, jobs = [], []
+    for plan in plans:
+        over = failed.get(plan.directory, {})
+        left = [seed for seed in records.pending(plan) if seed not in over]
+        try:
+            begun = checkpoints.batches(plan) if left else {}
+        except BcrlError as error:
+            failed[plan.directory] = over | dict.fromkeys(left, str(error))
+            continue
+        for batch, share in begun.items():
+            if set(batch) & set(left):
+                jobs.append(Job(plan, batch, share))
+                left = [seed for seed in left if seed not in batch]
+        if left:
+            pending.append((plan, left))
+    workers = plans[0].config["workers"]
+    # With enough variants for all workers, larger batches cost less per seed.
+    spread = 1 if len(pending) >= 2 * workers else workers
+    for plan, seeds in pending:
+        jobs += [Job(plan, batch) for batch in _divided(seeds, plan.lockstep, spread)]
+    return sorted(jobs, key=lambda job: -job.seconds)
+
+
+def _divided(seeds: list[int], lockstep: int, workers: int) -> list[tuple[int, ...]]:
+    """Batches of at most `lockstep` seeds, spread evenly over the workers."""
+    workers = min(workers, len(seeds))
+    rounds = -(-len(seeds) // (lockstep * workers))
+    number = min(rounds * workers, len(seeds))
+    return [tuple(part.tolist()) for part in np.array_split(seeds, number)]

@@ -1,0 +1,339 @@
+"""What the command says without running, a debug run, and a user's own defaults."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bcrl import cli
+from bcrl.common.identity import identity
+from bcrl.config import flags, jobs
+from bcrl.config.hydra_compose import CONF
+from bcrl.errors import BcrlError
+from bcrl.run import locks, records, runner
+from bcrl.run import status as overview
+from tests.conftest import arguments, plan, plans
+
+PROGRAM = "import sys; sys.argv[0] = 'bcrl'; from bcrl.cli import main; main()"
+SMALL = ("env=maze", "algorithm/regressor=tabular", "scale=smoke", "progress=none")
+
+
+def everything(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+# --- the help ---
+
+
+def test_the_help_names_every_group_option_and_flag_on_a_screen():
+    text = flags.manual(None)
+    assert len(text.splitlines()) <= 62 and max(map(len, text.splitlines())) <= 92
+    for path in CONF.glob("*/*.yaml"):
+        if path.parent.name not in ("budget", "tuned", "local"):
+            assert re.search(rf"^  {path.parent.name} ", text, re.M), path
+            assert re.search(rf"\b{path.stem}\b", text), path
+    for flag in ("--dry-run", "--status", "--config-dir", "-m "):
+        assert flag in text
+    for code in ("0 all", "1 seeds failed", "2 bad input", "75 interrupted"):
+        assert code in text
+
+
+def test_every_example_of_the_help_would_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = flags.manual(None).partition("\nExamples\n")[2].split("\n\n")[0]
+    examples = [line.strip() for line in text.split("\n")]
+    assert len(examples) >= 5
+    for line in examples:
+        words = shlex.split(line)
+        asked = flags.flag_parser().parse_intermixed_args([*words[1:], "--dry-run"])
+        assert words[0] == "bcrl" and asked.dry_run
+        assert "nothing was run or written" in overview.dry_run(jobs.plans(asked))
+    assert everything(tmp_path) == []
+
+
+def test_a_reader_may_leave_before_the_end(tmp_path):
+    command = [sys.executable, "-c", PROGRAM, "--help"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as asked:
+        asked.stdout.close()
+        assert (asked.stderr.read(), asked.wait()) == ("", 0)
+
+
+def test_a_users_options_are_in_the_help(own):
+    assert "my_maze" in flags.manual(str(own))
+    assert "my_maze" not in flags.manual(None).partition("Your own")[0]
+
+
+def test_help_and_tab_import_nothing_large(tmp_path):
+    program = """if True:
+        import sys
+        from bcrl.cli import main
+        sys.argv = ["bcrl", *sys.argv[1:]]
+        try:
+            main()
+        finally:
+            large = {"torch", "numba", "scipy", "sklearn", "matplotlib", "pandas"}
+            print(sorted(large & sys.modules.keys()), file=sys.stderr)
+    """
+    for asked in (["--help"], ["-sc", "query=bash"]):
+        done = subprocess.run(
+            [sys.executable, "-c", program, *asked],
+            env={**os.environ, "COMP_LINE": "bcrl env="},
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+        )
+        assert done.stdout and done.stderr == "[]\n"
+
+
+# --- Tab ---
+
+COMPLETED = """
+eval "$(bcrl -sc install=bash)"
+COMP_LINE="$1"; COMP_POINT=${#1}; words=($1); COMP_CWORD=$(( ${#words[@]} - 1 ))
+hydra_bash_completion
+echo "${COMPREPLY[@]}"
+"""
+TAB = {
+    "bcrl env=ca": {"env=car_on_hill", "env=cart_pole"},
+    "bcrl --config-dir OWN env=my": {"env=my_maze"},
+    "bcrl env=maze -m curriculum=": {"curriculum=off", "curriculum=on"},
+    "bcrl env=maze algorithm.reg": {"algorithm.regressor."},
+    "bcrl algorithm.ep": {"algorithm.episodes=", "algorithm.epsilon="},
+    "bcrl env=maze --dr": {"--dry-run"},
+    "bcrl env=maze hydra.searchpath=[pkg://antigravity] boos": {"boosting="},
+}
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """A folder of configs of one's own."""
+    (tmp_path / "mine" / "env").mkdir(parents=True)
+    (tmp_path / "mine" / "env" / "my_maze.yaml").write_text("name: maze\n")
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    return tmp_path / "mine"
+
+
+def test_tab_completes_flags_options_groups_and_keys(own):
+    for line, proposed in TAB.items():
+        found = flags.completions(line.replace("OWN", str(own)))
+        assert {x for x in found if not x.startswith("boosting.")} == proposed
+    assert "antigravity" not in sys.modules
+    assert {"env=", "seeds.", "workers="} <= set(flags.completions("bcrl "))
+    assert flags.completions("bcrl env=nope te") == []
+
+
+@pytest.mark.slow
+def test_bash_proposes_them(own, tmp_path):
+    command = tmp_path / "bin" / "bcrl"
+    command.parent.mkdir()
+    command.write_text(f'#!/bin/sh\nexec {sys.executable} -c "{PROGRAM}" "$@"\n')
+    command.chmod(0o755)
+    done = subprocess.run(
+        ["bash", "--norc", "-c", COMPLETED, "bash", "bcrl env=ca"],
+        env={**os.environ, "PATH": f"{command.parent}:{os.environ['PATH']}"},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert done.stderr == "" and done.returncode == 0
+    assert set(done.stdout.split()) == TAB["bcrl env=ca"]
+
+
+# --- the dry run and the overview ---
+
+
+def test_a_dry_run_lists_what_is_left_and_writes_nothing(tmp_path):
+    options = (*SMALL, f"runs_dir={tmp_path}")
+    runner.run(plan(*options, "seeds.first=1", "seeds.count=1"))
+    before = everything(tmp_path)
+    swept = plans(
+        *options, "curriculum=on,off", "seeds.count=3", "workers=2", multirun=True
+    )
+    table = overview.dry_run(swept).splitlines()
+    name = swept[1].name  # FQI's, whose seed 1 is complete
+    (row,) = [x for x in table if x.startswith(f"{tmp_path}/smoke/maze/{name} ")]
+    assert row.split()[1:4] == ["1", "0,", "2"]
+    (row,) = [x for x in table if f"maze/C-{name.partition('@')[0]}@" in x]
+    assert row.split()[1:3] == ["0", "0–2"]
+    assert re.match(r"\d jobs, about 0\.\d core minutes, .* with workers=2", table[-1])
+    assert everything(tmp_path) == before
+
+
+def test_the_command_shows_tables_and_writes_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+
+    def ask(*words: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["bcrl", *words])
+        cli.main()
+        return capsys.readouterr().out
+
+    assert "runs/quick/maze/C-FQI" in ask(
+        "-m", "env=maze", "curriculum=on", "--dry-run"
+    )
+    assert ask("--status", "env=maze").count("quick maze") == 1
+    assert "height" in ask("env=maze", "--cfg", "job")
+    with pytest.raises(SystemExit, match="2"):
+        ask("--status")
+    assert "holds no runs" in capsys.readouterr().err
+    assert everything(tmp_path) == []
+
+
+def states(text: str) -> dict[str, list[int]]:
+    """Row by row: seeds, complete, running, interrupted, failed, waiting."""
+    head, *rows = text.splitlines()
+    ends = [
+        re.search(rf"\b{word}\b", head).end() for word in ("seeds", *overview.STATES)
+    ]
+    found = {}
+    for row in rows[: [x.startswith("in all") for x in rows].index(True)]:
+        cells = [row[:end].rsplit("  ", 1)[-1].strip() for end in ends]
+        found[row.split("  ")[0]] = [int(cell or 0) for cell in cells]
+    return found
+
+
+def test_the_overview_tells_states_apart_by_locks_and_files(tmp_path):
+    options = (*SMALL, f"runs_dir={tmp_path}", "tag=t")
+    runner.run(plan(*options, "seeds.count=2"))
+    p = plan(*options, "seeds.count=6")
+    for seed, status in ((2, "running"), (3, "running"), (4, "failed: key=1: no")):
+        records.write_status(p, seed, status, {})
+    computing = locks.seed_lock(p.directory, 2)
+    assert computing.acquire()
+    before = everything(tmp_path)
+    for asked in (
+        arguments(*options, "seeds.count=6"),  # what this command would run
+        arguments(f"runs_dir={tmp_path}"),  # all that was ever begun
+    ):
+        said = overview.status(asked)
+        assert states(said) == {"smoke maze FQI@t": [6, 2, 1, 1, 1, 1]}
+        assert "FQI@t, seed 4: failed: key=1: no" in said
+    assert everything(tmp_path) == before and computing.holds()
+    computing.release()
+    assert states(overview.status(asked))["smoke maze FQI@t"] == [6, 2, 0, 2, 1, 1]
+
+
+def test_a_checkpoint_tells_how_far_its_seeds_are(tmp_path, monkeypatch):
+    from bcrl.run import checkpoints
+
+    p = plan(
+        *SMALL,
+        "curriculum=on",
+        f"runs_dir={tmp_path}",
+        "checkpoint_every=1e-9",
+        "seeds.count=1",
+        "tag=t",
+    )
+    real, saved = checkpoints.save_checkpoint, []
+
+    def save(*given):
+        saved.append(given[2])
+        real(*given)
+        if len(saved) == 6:
+            raise MemoryError
+
+    monkeypatch.setattr(checkpoints, "save_checkpoint", save)
+    with pytest.raises(runner.SeedsFailed):
+        runner.run(p)
+    assert saved == sorted(saved) and 0 < saved[-1] < 1
+    assert checkpoints.batches(p) == {(0,): saved[-1]}
+    assert checkpoints.shares(p.directory) == {0: saved[-1]}
+    records.write_status(p, 0, "running", {})
+    row = overview.status(arguments(f"runs_dir={tmp_path}")).splitlines()[1]
+    assert f" {100 * saved[-1]:.0f} %" in row
+
+
+# --- debug and local ---
+
+
+def test_debug_is_small_strict_alone_and_apart(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    p = plan("env=maze", "variant=BC", "algorithm/regressor=tabular", "debug=on")
+    assert p.root.parent == Path("runs/.debug") and p.config["workers"] == 1
+    assert p.seeds == (0,) and p.name.startswith("BC-FQI")
+    runner.run(p)
+    assert records.is_complete(p.directory, 0)
+
+
+@pytest.mark.parametrize("strict", [True, False])
+def test_strict_makes_errors_of_numpys_warnings(tmp_path, monkeypatch, strict):
+    from bcrl.q.regressors.ours import Tabular
+
+    real = Tabular.fit
+
+    def fit(self, *arguments):
+        np.zeros(1) / np.zeros(1)
+        return real(self, *arguments)
+
+    monkeypatch.setattr(Tabular, "fit", fit)
+    p = plan(*SMALL, f"strict={strict}", f"runs_dir={tmp_path}", "seeds.count=1")
+    if strict:
+        with pytest.raises(runner.SeedsFailed, match="FloatingPointError: invalid"):
+            runner.run(p)
+    else:
+        with pytest.warns(RuntimeWarning, match="invalid value"):
+            runner.run(p)
+
+
+@pytest.fixture
+def local(tmp_path):
+    """Writes a user's local/default.yaml; gives the folder."""
+
+    def write(text: str, name: str = "default", folder: str = "mine") -> str:
+        path = tmp_path / folder / "local" / f"{name}.yaml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"# @package _global_\n{text}\n")
+        return str(tmp_path / folder)
+
+    return write
+
+
+def test_a_local_file_sets_a_users_paths_and_the_command_line_wins(local):
+    mine = local("{runs_dir: elsewhere, workers: 2, checkpoint_every: 5}")
+    (p,) = plans("env=maze", config_dir=mine)
+    assert p.directory == Path("elsewhere/quick/maze/FQI")  # no tag: same numbers
+    assert (p.config["workers"], p.config["checkpoint_every"]) == (2, 5)
+    (p,) = plans("env=maze", "workers=3", "experiment=fig5", config_dir=mine)
+    assert (p.config["workers"], p.root) == (3, Path("elsewhere"))
+    (p,) = plans("env=maze", "local=none", config_dir=mine)
+    assert p.root == Path("runs")
+    local("workers: 4", "cluster")
+    (p,) = plans("env=maze", "local=cluster", config_dir=mine)
+    assert (p.config["workers"], p.root) == (4, Path("runs"))
+    with pytest.raises(BcrlError, match=r"local=clutser: did you mean local=cluster\?"):
+        plans("env=maze", "local=clutser", config_dir=mine)
+
+
+def test_a_local_file_cannot_change_numbers_in_silence(local):
+    plain, mine = plan("env=maze"), local("algorithm: {episodes: 7}")
+    (p,) = plans("env=maze", config_dir=mine)
+    assert p.config["algorithm"]["episodes"] == 7
+    assert p.tag and p.directory != plain.directory
+    typed = plan("env=maze", "algorithm.episodes=7")
+    assert (p.tag, identity(p.config)) == (typed.tag, identity(typed.config))
+    with pytest.raises(BcrlError, match="cuont"):
+        plans("env=maze", config_dir=local("seeds: {cuont: 3}", folder="a"))
+    with pytest.raises(BcrlError, match="_target_"):
+        plans("env=maze", config_dir=local("env: {_target_: os.system}", folder="b"))
+
+
+def test_the_users_folder_is_found_and_named_in_what_is_recorded(
+    local, tmp_path, monkeypatch
+):
+    mine = local("runs_dir: elsewhere")
+    os.rename(mine, tmp_path / "bcrl")
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", ["bcrl", "env=maze", "-m"])
+    (p,) = jobs.plans(flags.arguments())
+    assert p.root == Path("elsewhere")
+    asked = flags.arguments()
+    assert asked.config_dir == str(tmp_path / "bcrl") and asked.unnamed
+    assert flags.for_hydra(asked) == ["--multirun"]
+    monkeypatch.setattr(sys, "argv", ["bcrl", "env=maze", "--config-dir=other"])
+    assert flags.arguments().config_dir == os.path.abspath("other")
