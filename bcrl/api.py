@@ -118,8 +118,8 @@ def run(
     """Train seeds through the stages, in lockstep; one row per seed and evaluation.
 
     Columns are seed, stage, task, then iteration and `metrics` (FQI) or step and the
-    metrics of docs/metrics.md (DQN). A seed's results do not depend on the other seeds.
-    Raises BcrlError for seeds that diverge.
+    metrics of docs/reference/metrics.md (DQN). A seed's results do not depend on the
+    other seeds. Raises BcrlError for seeds that diverge.
     """
     compiling.check()
     seeds, metrics, target = _checked(seeds), tuple(metrics), stages[-1].env

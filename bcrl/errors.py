@@ -1,4 +1,4 @@
-"""Errors that a user can mend: one clear message, no traceback."""
+"""Errors that a user can correct: one clear message, no traceback."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Iterable
 
 
 class BcrlError(Exception):
-    """Something the user can put right; the message says what and how."""
+    """An error that the user can correct; the message says what and how."""
 
     exit_code = 2  # of the command: bad input, or no place to write
 
 
 class ConfigError(BcrlError):
-    """A refused configuration value: names the key, the value and what is allowed."""
+    """A rejected configuration value: names the key, the value and what is allowed."""
 
     def __init__(self, key: str, value: object, allowed: str) -> None:
         super().__init__(f"{key}={value}: {allowed}")
@@ -24,7 +24,7 @@ class ConfigError(BcrlError):
 
 
 class LostSeeds(BcrlError):
-    """Some seeds of a team can't go on; `reasons` says why, by place in the team."""
+    """Some seeds of a batch have failed; `reasons` by their place in the batch."""
 
     def __init__(self, reasons: dict[int, str]) -> None:
         super().__init__("; ".join(dict.fromkeys(reasons.values())))

@@ -12,7 +12,7 @@ import tempfile
 import time
 from argparse import Namespace
 
-from bcrl.config import schema, vetting
+from bcrl.config import jobs, schema
 from bcrl.results.layout import seed_path
 from bcrl.run import checkpoints, runner
 
@@ -42,7 +42,7 @@ class Timed:
 
 
 def main(every: str = "60") -> None:
-    schema.register()
+    schema.register_schema()
     print(f"{'':14}{'run, s':>8}{'written':>9}{'MiB':>8}{'ms each':>9}{'share':>8}")
     for name, choice in CHOICES.items():
         with tempfile.TemporaryDirectory() as folder:
@@ -53,7 +53,7 @@ def main(every: str = "60") -> None:
                 config_dir=None,
                 config_name=None,
             )
-            (plan,) = vetting.plans(asked)
+            (plan,) = jobs.plans(asked)
             timed = Timed(checkpoints.save_checkpoint)
             checkpoints.save_checkpoint = timed
             runner.run(plan)

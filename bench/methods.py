@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from bcrl.config import schema, vetting
+from bcrl.config import jobs, schema
 from bcrl.config.plan import Plan
 from bcrl.evaluation.step_metrics import evaluate
 from bcrl.learning.dqn import DQNTrainer
@@ -31,7 +31,7 @@ def planned(variant: str) -> Plan:
     """The method's plan, its pretraining in LQ cut short."""
     choice = ["env=linear_system", "algorithm=dqn", f"variant={variant}"]
     choice += ["algorithm.steps=[600,30000]"] * (variant == "C")
-    (plan,) = vetting.plans(
+    (plan,) = jobs.plans(
         Namespace(overrides=choice, multirun=False, config_dir=None, config_name=None)
     )
     return plan
@@ -81,7 +81,7 @@ def multiplying() -> float:
 
 
 def main() -> None:
-    schema.register()
+    schema.register_schema()
     torch.set_num_threads(1)
     print(
         f"this core multiplies (32, 128) by (128, 128) at {multiplying():.0f} GFLOP/s"

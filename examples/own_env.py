@@ -1,7 +1,7 @@
 """An own environment: swing a pendulum up, with ever less torque.
 
 An environment is a frozen dataclass of its constants with pure functions on arrays,
-so that all episodes of all seeds are stepped at once; docs/own.md says more.
+so that all episodes of all seeds are stepped at once; docs/howto/own.md says more.
 """
 
 from dataclasses import dataclass

@@ -10,10 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from bcrl.config import guard, vetting
+from bcrl.common import plugins
+from bcrl.config import jobs
 from bcrl.config.plan import Plan
 
-guard.register()
+
+@pytest.fixture(autouse=True)
+def _trusts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which code of the user's may be named is forgotten after each test."""
+    monkeypatch.setenv(plugins.VARIABLE, "")
 
 
 def arguments(
@@ -30,7 +35,7 @@ def arguments(
 
 def plans(*overrides: str, **options) -> list[Plan]:
     """The plans that `bcrl *overrides` would run; options as in `arguments`."""
-    return vetting.plans(arguments(*overrides, **options))
+    return jobs.plans(arguments(*overrides, **options))
 
 
 def plan(*overrides: str) -> Plan:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bcrl.config import shell, vetting
+from bcrl.config import flags, jobs
 from bcrl.run import status
 
 ROOT = Path(__file__).parents[1]
@@ -48,9 +48,9 @@ COMMANDS = dict.fromkeys(
 def test_every_command_would_run(line, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = shlex.split(line)[1:]
-    arguments = shell.parser().parse_intermixed_args(words)
+    arguments = flags.flag_parser().parse_intermixed_args(words)
     if not arguments.status:
-        assert "nothing was run" in status.dry_run(vetting.plans(arguments))
+        assert "nothing was run" in status.dry_run(jobs.plans(arguments))
 
 
 def anchors(page: Path) -> set[str]:
@@ -77,6 +77,13 @@ def test_named_files_exist(page):
         page.read_text("utf-8"),
     ):
         assert (ROOT / name).exists(), name
+
+
+def test_pages_that_code_and_configs_name_exist():
+    for folder, ending in (("bcrl", "py"), ("conf", "yaml"), ("examples", "py")):
+        for path in (ROOT / folder).rglob(f"*.{ending}"):
+            for name in re.findall(r"docs/[\w/]+\.md", path.read_text("utf-8")):
+                assert (ROOT / name).exists(), (path, name)
 
 
 SHORT = {

@@ -3,9 +3,12 @@
 import os
 import re
 import shlex
+import sys
 from pathlib import Path
 
 import pytest
+
+from bcrl import cli
 
 DOC = (Path(__file__).parents[1] / "docs" / "howto" / "own.md").read_text()
 #: Each block of a file, whole, by the path that one of its first lines names.
@@ -35,18 +38,42 @@ def test_the_page_has_a_file_and_a_command_of_each_kind():
     assert len(COMMANDS) == len(RESULTS)
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The page's files, and their code on Python's path."""
+    place = tmp_path_factory.mktemp("own")
+    for name, text in FILES:
+        path = place / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    code = str(place / "code")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(code)
+        patch.setenv("PYTHONPATH", code, prepend=os.pathsep)  # of workers
+        yield place
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "names"), list(zip(COMMANDS, RESULTS.values(), strict=True))
 )
-def test_it_runs_from_outside(bcrl, tmp_path, monkeypatch, command, names):
-    for name, text in FILES:
-        path = tmp_path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "code"), prepend=os.pathsep)
-    small = ["scale=smoke", "seeds.count=1", "progress=none"]
-    done = bcrl(*shlex.split(command), *small)
-    assert done.returncode == 0, done.stderr
-    folder = tmp_path / "runs" / "smoke" / "swing_up"
+def test_it_runs_from_outside(folder, monkeypatch, command, names):
+    monkeypatch.chdir(folder)
+    workers = 2 if "regressor" in command else 1  # processes that import the code
+    small = ["scale=smoke", "seeds.count=2", "progress=none", f"workers={workers}"]
+    small += ["seeds.lockstep=1", f"runs_dir=runs/{len(command)}"]
+    monkeypatch.setattr(sys, "argv", ["bcrl", *shlex.split(command), *small])
+    cli.main()
     for name in names:
-        assert list(folder.glob(f"{name}/seed_0000.csv")), list(folder.iterdir())
+        made = folder.glob(f"runs/{len(command)}/smoke/swing_up/{name}/seed_0001.csv")
+        assert list(made), list(folder.rglob("seed_*.csv"))
+
+
+def test_a_config_alone_may_not_name_the_code(folder, monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    (tmp_path / "bcrl").symlink_to(folder / "conf")  # found, but not named
+    monkeypatch.setattr(sys, "argv", ["bcrl", "env=swing_up", "--dry-run"])
+    with pytest.raises(SystemExit, match="2"):
+        cli.main()
+    assert "env.name=mine.swing_up" in capsys.readouterr().err

@@ -11,6 +11,9 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from bcrl.errors import ConfigError, did_you_mean
 
+#: The words for a type in a message.
+NOUNS = {int: "an integer", float: "a number", str: "text", bool: "true or false"}
+
 
 def one_of(key: str, value: object, allowed: Sequence[str]) -> None:
     """Raise ConfigError unless `value` is one of `allowed`."""
@@ -33,9 +36,13 @@ def construct(section: str, cls: type, values: Mapping[str, Any]) -> Any:
         try:
             taken[key] = _taken(value, hint)
         except TypeError:
-            name = getattr(hint, "__name__", hint) if isinstance(hint, type) else hint
-            kind = str(name).replace("typing.", "")
-            raise ConfigError(place, value, f"must be of type {kind}") from None
+            if get_origin(hint) is Literal:
+                why = did_you_mean(str(value), map(str, get_args(hint)))
+            else:
+                name = hint.__name__ if isinstance(hint, type) else hint
+                kind = f"of type {str(name).replace('typing.', '')}"
+                why = f"must be {NOUNS.get(hint, kind)}"
+            raise ConfigError(place, value, why) from None
     for key, field_ in fields.items():
         lacks = field_.default is field_.default_factory is dataclasses.MISSING
         if lacks and key not in values:
@@ -78,21 +85,3 @@ def _taken(value: Any, hint: Any) -> Any:
     elif type(value) is kind:
         return value
     raise TypeError
-
-
-def per_task(
-    key: str, value: Any, n_tasks: int, kind: type, least: float, most: float = math.inf
-) -> list:
-    """A budget's value for each task, from one value or a list of `n_tasks`."""
-    values = value if isinstance(value, list) else [value] * n_tasks
-    if len(values) != n_tasks:
-        raise ConfigError(
-            key, value, f"has {len(values)} entries, but there are {n_tasks} tasks"
-        )
-    bounds = f"at least {least:g}" if most == math.inf else f"in [{least:g}, {most:g}]"
-    for entry in values:
-        kinds = (int, float) if kind is float else (int,)
-        if type(entry) not in kinds or not least <= entry <= most:
-            noun = "integer" if kind is int else "number"
-            raise ConfigError(key, value, f"every entry must be one {noun} {bounds}")
-    return [kind(entry) for entry in values]

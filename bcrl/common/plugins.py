@@ -1,19 +1,50 @@
-"""Modules of the user's own that a config may name: BCRL_TRUST=my_package,my.module."""
+"""Modules of the user's own: which ones a config may name, and their sources.
+
+A config alone names none. Names that were typed are the user's own, as are names in
+a folder that was passed by --config-dir, and modules that BCRL_TRUST=a,b.c lists.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import importlib
 import importlib.util
 import os
-from collections.abc import Collection
+import re
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from bcrl.common.identity import flat
 from bcrl.errors import ConfigError
 
-VARIABLE = "BCRL_TRUST"  # of the process's environment; no config can set it
+VARIABLE = "BCRL_TRUST"  # of this process and the workers that it starts
+#: The keys whose values may name code.
+NAMING = (
+    *("env.name", "env.id", "env.observation", "env.wrappers", "algorithm.name"),
+    *("algorithm.regressor.name", "curriculum.name", "transfer.name", "logger.name"),
+)
+
+
+def named_code(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """The keys of a config that name code of the user's, each with the name."""
+    values = flat(dict(config))
+    for key in NAMING:
+        value = values.get(key)
+        for one in value if isinstance(value, list) else [value]:
+            name = one.get("name") if isinstance(one, dict) else one
+            end = ":" if key == "env.id" else "."
+            if isinstance(name, str) and (end in name or is_trusted(name)):
+                yield key, name
+
+
+def trust(name: str) -> None:
+    """Let configs name the package that `name` begins with, here and in workers."""
+    package = re.split("[.:]", name)[0]
+    if not is_trusted(package):
+        os.environ[VARIABLE] = ",".join([*_listed(), package])
 
 
 def is_foreign(name: str, ours: Collection[str]) -> bool:
@@ -22,12 +53,11 @@ def is_foreign(name: str, ours: Collection[str]) -> bool:
 
 
 def is_trusted(name: str) -> bool:
-    """Whether `name` is a module that BCRL_TRUST lists, or lies below one."""
+    """Whether `name` is a trusted module, or lies below one."""
     return any(f"{name}.".startswith(f"{entry}.") for entry in _listed())
 
 
 def _listed() -> list[str]:
-    """What BCRL_TRUST names."""
     entries = os.environ.get(VARIABLE, "").split(",")
     return [entry.strip() for entry in entries if entry.strip()]
 
@@ -40,8 +70,10 @@ def module(key: str, name: str, where: str, known: Collection[str] = ()) -> Modu
     if not all(part.isidentifier() for part in where.split(".")):
         raise ConfigError(key, name, "isn't the name of a module")
     if where.partition(".")[0] not in known and not is_trusted(where):
-        why = "isn't of this package; if you trust its code, set the environment "
-        raise ConfigError(key, name, f"{why}variable {VARIABLE}={where.split('.')[0]}")
+        why = (
+            "a config alone can't name code of yours; type it on the command line, or "
+        )
+        raise ConfigError(key, name, why + "pass the config's folder by --config-dir")
     try:
         return importlib.import_module(where)
     except Exception as error:  # whatever its code does
@@ -49,19 +81,19 @@ def module(key: str, name: str, where: str, known: Collection[str] = ()) -> Modu
         raise ConfigError(key, name, why) from error
 
 
-def sources() -> list[Path]:
-    """The Python files of what is trusted and can be found."""
-    found: list[Path] = []
-    for entry in _listed():
-        try:
-            spec = importlib.util.find_spec(entry)
-        except Exception:  # of a package above it; who imports it will say so
-            continue
-        for folder in (spec and spec.submodule_search_locations) or ():
-            found += Path(folder).rglob("*.py")
-        if spec and spec.origin and not spec.submodule_search_locations:
-            found.append(Path(spec.origin))
-    return sorted(path for path in found if path.is_file())  # not "built-in"
+def fingerprint(config: Mapping[str, Any]) -> str:
+    """A digest of the sources of the user's packages that a config names, or ""."""
+    packages = {re.split("[.:]", name)[0] for _, name in named_code(config)} - {"bcrl"}
+    digest = hashlib.sha256()
+    for package in sorted(packages):
+        spec = importlib.util.find_spec(package)
+        folders = (spec and spec.submodule_search_locations) or ()
+        found = [path for folder in folders for path in Path(folder).rglob("*.py")]
+        if spec and spec.origin and not folders:  # not "built-in"
+            found = [Path(spec.origin)]
+        for path in sorted(filter(Path.is_file, found)):
+            digest.update(path.read_bytes())
+    return digest.hexdigest() if packages else ""
 
 
 def attribute(key: str, name: str, dotted: str, known: Collection[str] = ()) -> Any:

@@ -9,16 +9,14 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path, PurePath
-from typing import Any
+from pathlib import PurePath
 
 from hydra.core.override_parser.types import ChoiceSweep, Glob
 
-from bcrl.config import guard
-from bcrl.config.hydra_compose import CONF, Folders, keys_of_group
+from bcrl.common.terminal import say
+from bcrl.config.hydra_compose import Paths, group_names, now, options
 from bcrl.config.overrides import parse
-from bcrl.config.safety import NAME
-from bcrl.config.schema import section_of_seeds, texts
+from bcrl.config.schema import NAME, section_of_seeds, texts
 from bcrl.errors import ConfigError
 
 #: A quoted string, or bare text up to what ends it.
@@ -33,13 +31,14 @@ COMPUTED = re.compile(r"\s*(range|interval|glob|int|float|bool|str|json_str)\s*\
 NUMBER = re.compile(r"[+-]?[\d.][\w.+-]*|[+-]?(nan|inf)|true|false", re.IGNORECASE)
 
 
-def canonical(overrides: Sequence[str], folders: Folders) -> list[str]:
+def canonical(overrides: Sequence[str], folders: Paths) -> list[str]:
     """The overrides as Hydra should read them; BcrlError for what can't be read.
 
     What is canonical stays as it is.
     """
     found: dict[str, None] = {}
-    for text in (text for each in overrides for text in _canonical(each, folders)):
+    given = _without_local(overrides)
+    for text in (text for each in given for text in _canonical(each, folders)):
         head = text.partition("=")[0]
         if head.startswith("seeds."):  # the last one holds
             found = {old: None for old in found if old.partition("=")[0] != head}
@@ -47,44 +46,42 @@ def canonical(overrides: Sequence[str], folders: Folders) -> list[str]:
     return list(found)
 
 
-def options(group: str, folders: Folders) -> list[str]:
-    """The names of a group's options."""
-    places = [Path(folder, group) for folder in (CONF, *folders)]
-    return sorted({path.stem for place in places for path in place.glob("*.yaml")})
+def _without_local(overrides: Sequence[str]) -> list[str]:
+    """The overrides, with workers in place of the former launcher `local`."""
+    if "hydra/launcher=local" not in overrides:
+        return list(overrides)
+    typed = [o.partition("n_jobs=")[2] for o in overrides if "launcher.n_jobs=" in o]
+    line = f"workers={next(filter(str.isdecimal, typed), os.cpu_count())}"
+    say(f"hydra/launcher=local: this launcher is gone; the command runs with {line}")
+    launcher = ("hydra/launcher=", "hydra.launcher.")
+    chosen = [o for o in overrides if not o.startswith(launcher)]
+    return chosen if any(o.startswith("workers=") for o in chosen) else [*chosen, line]
 
 
-def _canonical(text: str, folders: Folders) -> Iterator[str]:
-    text = NOW.sub(lambda found: guard.now(found[1]), text)
+def _canonical(text: str, folders: Paths) -> Iterator[str]:
+    text = NOW.sub(lambda found: now(found[1]), text)
     (override,) = parse([text])
     key, value = override.key_or_group, override.value()
     head, equals, raw = text.partition("=")
+    is_group = key in group_names(folders)
     if override.is_delete() or not equals:
         yield text
     elif key in ("seed", "seeds") or (key == "seeds.only" and value is not None):
         yield from _seeds(key, value, raw)
     elif isinstance(value, Glob):
-        if not _is_group(key, folders):
-            raise ConfigError(key, raw, "glob(…) picks options of a group; list values")
-        names = value.filter(options(key, folders))
+        names = value.filter(options(key, folders)) if is_group else []
         if not names:
-            why = f"matches none of {key}'s options"
-            raise ConfigError(key, raw, f"{why}: {', '.join(options(key, folders))}")
+            known = ", ".join(options(key, folders)) if is_group else "no group"
+            why = f"glob(…) picks options of a group; {key} has {known}"
+            raise ConfigError(key, raw, why)
         plain = all(map(NAME.fullmatch, names))
         yield f"{head}={','.join(names if plain else map(_quoted, names))}"
-    elif isinstance(value, list) and _is_group(key, folders):
-        yield text  # no option: refused as it was typed
-    elif key == "hydra.searchpath":
-        yield f"{head}={_words(raw, _folder)}"
-    elif (
-        not COMPUTED.match(raw)
-        and (
-            named := _words(
-                CHOICE.sub(r"\1\2", raw), _within if key == "runs_dir" else _name
-            )
-        )
-        != raw
-    ):
-        yield f"{head}={named}" if _is_text(key, folders) else text
+    elif COMPUTED.match(raw) or (is_group and isinstance(value, list)):
+        yield text
+    elif is_group or key in texts() or key.endswith((".name", ".id")):
+        change = _within if key == "runs_dir" else _name
+        named = _words(CHOICE.sub(r"\1\2", raw), change)
+        yield f"{head}={named}" if named != raw else text
     else:
         yield text
 
@@ -127,32 +124,3 @@ def _within(text: str, quoted: bool) -> str | None:
     """A folder that was typed and leads out of this one, as an absolute path."""
     leads_out = ".." in PurePath(text).parts and not os.path.isabs(text)
     return os.path.realpath(text) if leads_out else _name(text, quoted)
-
-
-def _folder(text: str, quoted: bool) -> str | None:
-    path = text.removeprefix("file://")
-    if "://" in path or os.path.isabs(path) or not path:
-        return None
-    return f"file://{os.path.abspath(path)}"
-
-
-def _is_group(key: str, folders: Folders) -> bool:
-    return any(Path(folder, key).is_dir() for folder in (CONF, *folders))
-
-
-def _is_text(key: str, folders: Folders) -> bool:
-    """Whether a key's value is text by the schema, or by an option that has the key."""
-    if key in texts() or _is_group(key, folders):
-        return True
-    parts = key.split(".")
-    groups = ["/".join(parts[:n]) for n in range(1, len(parts))]
-    shipped = [keys_of_group(group, folders).get(key, {}) for group in groups]
-    named = [each for found in shipped for v in found.values() for each in _parts(v)]
-    # YAML reads 1e-4 as text, too.
-    return any(
-        isinstance(v, str) and "${" not in v and not NUMBER.fullmatch(v) for v in named
-    )
-
-
-def _parts(value: Any) -> list:
-    return value if isinstance(value, list) else [value]

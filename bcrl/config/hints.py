@@ -2,29 +2,96 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
-from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep, Sweep
+from hydra.core.override_parser.types import RangeSweep
 from omegaconf import OmegaConf
 
-from bcrl.common.identity import flat
-from bcrl.config.bounds import check_override
-from bcrl.config.command import options
-from bcrl.config.habits import ALIASES, ALONE, NO, VALUES, YES
+from bcrl.common.identity import Plain, flat
 from bcrl.config.hydra_compose import (
     CONFIG_NAME,
     NO_ENV,
-    Folders,
+    Paths,
     Unknown,
     composed,
-    keys_of_options,
+    group_names,
+    options,
+    read_option,
 )
 from bcrl.config.overrides import parse
+from bcrl.config.safety import check_override
 from bcrl.errors import BcrlError, closest
+
+#: Other tools' words for our keys.
+_TABLE = {
+    "algorithm.learning_rate": "lr alpha step_size",
+    "env.gamma": "discount gamma",
+    "algorithm.regressor.trees": "n_estimators n_trees",
+    "algorithm.replay_size": "buffer_size memory_size replay_buffer",
+    "algorithm.steps": "total_timesteps timesteps n_steps max_steps num_steps",
+    "algorithm.iterations": "n_iterations num_iterations iters",
+    "algorithm.episodes": "n_episodes num_episodes",
+    "algorithm.target_update": "target_update_interval target_update_freq",
+    "algorithm.epsilon": "eps epsilon_greedy exploration",
+    "algorithm.hidden": "net_arch hidden_sizes layers",
+    "algorithm.batch_size": "batch",
+    "env.horizon": "max_episode_steps",
+    "workers": "n_jobs num_workers n_workers jobs processes",
+    "threads": "n_threads num_threads",
+    "seeds": "n_seeds num_seeds random_state random_seed",
+    "runs_dir": "output out output_dir outdir log_dir logdir results save_dir",
+    "tag": "name run_name exp_name",
+    "env": "environment task game",
+    "algorithm": "algo agent method",
+    "experiment": "exp figure fig",
+    "algorithm/regressor": "regressor model approximator",
+    "hydra/launcher": "launcher",
+    "checkpoint_every": "checkpoint save_every",
+    "progress": "verbose log_level",
+    "scale": "size budget_scale",
+    "env.id": "env_id gym",
+    "device": "use_cuda use_gpu cuda gpu use_device",
+}
+#: Whole words that are neither key nor value, and what they mean.
+_WORDS = {
+    "--help": "help ? usage man",
+    "--version": "version v",
+    "--status": "status ls list",
+    "--dry-run": "dry_run dryrun n dry preview",
+    "-m": "sweep multi m",
+    "device=cuda": "cuda gpu",
+    "device=cpu": "cpu",
+    "debug=on": "debug",
+    "progress=none": "quiet q silent",
+    "--config-dir": "config config_file c",
+    "hydra/launcher=slurm": "slurm",
+    "workers=2": "local joblib",
+    "logger=tensorboard": "tensorboard",
+}
+_ALIASES = {word: ours for ours, words in _TABLE.items() for word in words.split()}
+_FLAGS = {word: ours for ours, words in _WORDS.items() for word in words.split()}
+#: Other words for values: those of a key, those of any group.
+_VALUES = {
+    "device": {"gpu": "cuda", "true": "cuda", "yes": "cuda", "1": "cuda", "mps": "cpu"},
+    "progress": {"false": "none", "off": "none", "true": "bar", "on": "bar"},
+    "variant": {"fqi": "plain", "dqn": "plain", "none": "plain", "off": "plain"},
+}
+#: The groups whose options have keys.
+_SECTIONS = (
+    "env",
+    "algorithm",
+    "algorithm/regressor",
+    "boosting",
+    "transfer",
+    "logger",
+)
+_YES, _NO = ("true", "yes", "1", "on"), ("false", "no", "0", "off", "none", "null")
 
 
 @dataclass(frozen=True)
@@ -32,283 +99,216 @@ class Hints:
     """Suggestions for one command line: its overrides, and folders besides ours."""
 
     overrides: tuple[str, ...]
-    folders: Folders = ()
+    folders: Paths = ()
 
     @cached_property
     def groups(self) -> dict[str, list[str]]:
         """The options of each group."""
-        groups = [key for key, found in self.brought.items() if not found]
-        return {group: options(group, self.folders) for group in groups}
+        found = {
+            name: options(name, self.folders) for name in group_names(self.folders)
+        }
+        return found | {"hydra/launcher": ["slurm"], "hydra/sweeper": ["basic"]}
 
     @cached_property
-    def brought(self) -> dict[str, dict[str, object]]:
-        """The keys that options bring."""
-        return keys_of_options(self.folders)
-
-    @cached_property
-    def present(self) -> dict[str, object]:
-        """The keys that there are with the same choices."""
+    def present(self) -> Plain:
+        """The keys that there are with the same choices, and their values."""
         chosen = [o for o in self.overrides if o.partition("=")[0] in self.groups]
         for asked in (tuple(chosen), ("env=maze", *chosen), ("env=maze",)):
-            try:
-                job = OmegaConf.to_container(composed(CONFIG_NAME, asked, self.folders))
-            except BcrlError:
-                continue
-            del job["hydra"]
-            return {"seeds": None, "seed": None} | flat(job)
+            with contextlib.suppress(BcrlError):
+                job = composed(CONFIG_NAME, asked, self.folders)
+                values: Any = OmegaConf.to_container(job)
+                del values["hydra"]
+                return {"seeds": None, "seed": None} | flat(values)
         return {}
 
-    def words(self, typed: str, value: str | None = None) -> str | None:
+    @cached_property
+    def brought(self) -> dict[str, str]:
+        """The keys that options bring into their section, and the first such option."""
+        found: dict[str, str] = {}
+        for group in _SECTIONS:
+            for name in self.groups[group]:
+                for key in flat(read_option(group, name, self.folders)):
+                    whole = f"{group.replace('/', '.')}.{key}"
+                    found.setdefault(whole, f"{group}={name}")
+        return found
+
+    @cached_property
+    def spellings(self) -> dict[str, str]:
+        """Groups and keys by what they may be called: parts left out, or a plural."""
+        known = [*self.groups, *self.present, *self.brought]
+        found: dict[str, str] = {}
+        for name in known:
+            found.setdefault(name.lower().replace("/", "."), name)
+        for name in known:
+            parts = re.split("[./]", name.lower())
+            for form in (parts[-1], f"{parts[0]}.{parts[-1]}", ".".join(parts[-2:])):
+                for spelled in (form, form.removesuffix("s"), f"{form}s"):
+                    found.setdefault(spelled, name)
+        return found
+
+    def line(self, typed: str, value: str | None = None) -> str | None:
         """What to type for a key or a whole word, which may have its value."""
         key, equals, given = typed.lstrip("+~-").partition("=")
-        value = given if equals else value
+        text = given if equals else value
         norm = re.sub(r"[\s-]", "_", key.strip().lower())
-        if value is None and norm in ALONE:
-            return ALONE[norm].format(norm)
-        if value is None:
-            return self._option_of_any(key)
-        value = value.strip()
-        if re.fullmatch(r"(use_)?(cuda|gpu)|.*device", norm) and re.match(
-            "cuda|gpu|true|yes|1", value.lower()
-        ):
-            return "device=cuda"
-        for name in dict.fromkeys((ALIASES.get(norm, norm), norm)):
-            if (found := self._exact(name)) is not None:
-                return self._with(found, value)
-        near = self._like(norm)
-        return None if near is None else self._with(near, value)
-
-    def _exact(self, name: str) -> str | None:
-        """The group or key that a name is, but for case, number, or parts left out."""
-        candidates = [*self.groups, *self.present, *self.brought]
-        slashed = name.replace(".", "/")
-        for wanted in (name, slashed, name.removesuffix("s"), f"{name}s"):
-            for known in candidates:
-                if known.lower() == wanted:
-                    return known
-        for known in candidates:
-            parts = iter(re.split("[./]", known.lower()))
-            if known.lower().endswith(name.rpartition(".")[2]) and all(
-                part in parts for part in name.split(".")
-            ):
-                return known
-        return None
-
-    def _like(self, name: str) -> str | None:
-        """The group or key that is spelt most like a name, or whose last part is."""
-        candidates = [*self.groups, *self.present, *self.brought]
-        last = {re.split("[./]", known)[-1]: known for known in reversed(candidates)}
-        near = closest(name, candidates, 0.6)
-        if near is None and (part := closest(name.rpartition(".")[2], last, 0.7)):
-            near = last[part]
-        return near
+        if text is None:
+            return _FLAGS.get(norm) or self._word(key.strip())
+        spelled = self.spellings
+        forms = [name.replace("/", ".") for name in (_ALIASES.get(norm, norm), norm)]
+        near = next((form for form in forms if form in spelled), None)
+        near = near or closest(norm, spelled, 0.6)
+        return self._with(spelled[near], text.strip()) if near else None
 
     def _with(self, key: str, value: str) -> str:
         """The key with its value, and before it the option that brings the key."""
-        if key in ("env", "env.id") and (ours := self.gymnasium(value)):
+        if key in ("env", "env.id") and (ours := gymnasium(value)):
             return ours
         if key in self.groups:
-            return f"{key}={self.option(key, value) or value or '…'}"
-        value = VALUES.get(key, {}).get(value.lower(), value)
+            return self._choice(key, value) or f"{key}={value or '…'}"
+        value = _VALUES.get(key, {}).get(value.lower(), value)
         if key in ("seeds", "seed"):
             return numbers(key, value)
-        option = "" if key in self.present else f"{next(iter(self.brought[key]))} "
+        option = "" if key in self.present else f"{self.brought[key]} "
         usual = self.present.get(key, "…")  # where none was typed
-        value = value or {None: "null", "???": "…"}.get(usual, usual)
+        value = value or str({None: "null", "???": "…"}.get(usual, usual))
         return f"{option}{key}={value}"
 
-    def _option_of_any(self, word: str) -> str | None:
-        """The option, of whatever group, that is called so, or nearly; else a flag."""
-        split = re.match(r"([\w./-]+)\s*[: ]\s*=?\s*(\S+)$", word.strip())
-        if split:
-            return self.words(split[1], split[2])
-        if ours := self.gymnasium(word):
-            return ours
+    def _word(self, word: str) -> str | None:
+        """What to type for a word alone: `env=maze` for maze, `tag=x` for `tag: x`."""
+        if split := re.match(r"([\w./-]+)\s*[: ]\s*=?\s*(\S+)$", word):
+            return self.line(split[1], split[2])
         first = ("env", "variant", "experiment")
-        order = [*first, *(group for group in self.groups if group not in first)]
-        for group in order:
-            for option in self.groups[group]:
-                if option.lower() == word.lower():
-                    return f"{group}={option}"
-        for group in order[:3]:
-            if option := self.option(group, word):
-                return f"{group}={option}"
-        return None
+        for group in (*first, *self.groups):
+            if word.lower() in map(str.lower, self.groups[group]):
+                return self._choice(group, word)
+        choices = (self._choice(group, word) for group in first)
+        return gymnasium(word) or next(filter(None, choices), None)
 
-    def gymnasium(self, value: str) -> str | None:
-        """`env=gymnasium env.id=CartPole-v1` for such an id."""
-        found = re.fullmatch(r"([\w.:/-]+)-v\d+", value)
-        return f"env=gymnasium env.id={value}" if found else None
-
-    def option(self, group: str, value: object) -> str | None:
-        """The option that a value means."""
-        known = self.groups.get(group, [])
-        text = str(value).strip("'\"[] ").lower().replace("-", "_")
-        text = VALUES.get(group, {}).get(text, text)
-        if text in YES and "on" in known:
-            return "on"
-        if text in NO and {"off", "none"} & set(known):
-            return "off" if "off" in known else "none"
-        lower = {name.lower(): name for name in known}
+    def _choice(self, group: str, value: object) -> str | None:
+        """`env=maze`, the option of a group that a value means, if there is one."""
+        known = {name.lower(): name for name in self.groups.get(group, ())}
+        whole = str(value).strip("'\"[] ").lower().replace("-", "_")
+        if group == "hydra/launcher" and whole in ("local", "joblib", "submitit_local"):
+            return "workers=2"
+        text = _VALUES.get(group, {}).get(whole, whole)
         text = text.replace("figure", "fig").removesuffix("_fqi").removesuffix("_dqn")
-        for form in (text, f"fig{text}", text.removeprefix("fig")):
-            if form in lower:
-                return lower[form]
-        inside = [name for name in lower if len(text) > 2 and text in name]
-        near = inside[0] if inside else closest(text, lower, 0.5)
-        return lower[near] if near else None
-
-    def refusals(self, parsed: Iterable[Override]) -> Iterator[str]:
-        """A message for each override that no option, key or number answers to."""
-        for override in parsed:
-            key, value = override.key_or_group, override.value()
-            typed = override.input_line
-            head, _, raw = typed.partition("=")
-            if isinstance(value, IntervalSweep):
-                some = ",".join(self.groups.get(key, ())[:2])
-                line = f"-m {head}={some or '0.1,0.5'}"
-                yield f"{typed}: intervals are for optimisers; did you mean {line}?"
-            elif key == "hydra/sweeper" and value != "basic":
-                yield f"{typed}: the only one is basic; did you mean {key}=basic?"
-            elif (
-                key in ("seed", "seeds")
-                and isinstance(value, (RangeSweep, str))
-                and not raw.startswith("${")
-            ):
-                yield f"{typed}: did you mean {numbers(key, raw)}?"
-            elif isinstance(value, Sweep) or override.is_delete():
-                continue
-            elif key in VALUES and str(value).lower() in VALUES[key]:
-                yield f"{typed}: did you mean {key}={VALUES[key][str(value).lower()]}?"
+        forms = [text, f"fig{text}"]
+        forms += ["on"] * (text in _YES) + ["off", "none"] * (text in _NO)
+        forms += [name for name in known if len(text) > 2 and text in name]
+        near = next((form for form in forms if form in known), None)
+        near = near or closest(text, known, 0.5 if len(known) > 1 else 0.0)
+        dqn = " algorithm=dqn" * (group == "variant" and whole.endswith("_dqn"))
+        return f"{group}={known[near]}{dqn}" if near else None
 
     def check(self) -> None:
         """Raise BcrlError for a word that isn't KEY=VALUE, or another tool's value."""
         for word in self.overrides:
             check_override(word)
-        for word, value in bare(self.overrides):
-            raise BcrlError(
-                f"{word!r} can't be read as KEY=VALUE; {self.mean(word, value)}"
-            )
-        for message in self.refusals(self._parsed()):
-            raise BcrlError(message)
+        for word, value in _bare(self.overrides):
+            why = f"{word!r} can't be read as KEY=VALUE"
+            raise BcrlError(f"{why}; {self.mean(word, value)}")
+        for override in parse(self.overrides):
+            key, given = override.key_or_group, override.value()
+            typed = override.input_line
+            raw = str(typed).partition("=")[2]
+            text = isinstance(given, RangeSweep | str) and not raw.startswith("${")
+            habit = _VALUES.get(key, {}) if key not in self.groups else {}
+            if (key in ("seed", "seeds") and text) or str(given).lower() in habit:
+                raise BcrlError(f"{typed}: did you mean {self._with(key, raw)}?")
 
     def swept(self) -> str:
         """What to say of several values without -m."""
-        several = [o for o in parse(self.overrides) if o.is_sweep_override()]
-        first = several[0].input_line
-        line = shlex.join(["bcrl", "-m", *self.overrides])
-        text = f"{first}: several values are a sweep; add -m: {line}"
-        if several[0].key_or_group in ("seed", "seeds"):  # more likely one run of them
-            text = (
-                f"{first}: did you mean {numbers('seeds', first)}? If a sweep: {line}"
-            )
-        return text
-
-    def _parsed(self) -> Iterator[Override]:
-        """The overrides; BcrlError for one that can't be read."""
-        for override in self.overrides:
-            key, _, value = override.partition("=")
-            try:
-                yield from parse([override])
-            except BcrlError as error:
-                line = f"{key}=$HOME{value[1:]}" if value.startswith("~") else ""
-                if key in self.groups:
-                    line = f"{key}={self.option(key, value) or self.groups[key][-1]}"
-                hint = f"; did you mean {line}?" if line else ""
-                raise BcrlError(f"{error}{hint}") from error
+        override = next(o for o in parse(self.overrides) if o.is_sweep_override())
+        first, line = override.input_line, shlex.join(["bcrl", "-m", *self.overrides])
+        if override.key_or_group.startswith("seed"):  # more likely one run of them
+            meant = numbers("seeds", str(first))
+            return f"{first}: did you mean {meant}? If a sweep: {line}"
+        return f"{first}: several values are a sweep; add -m: {line}"
 
     def explained(self, error: Unknown) -> str:
         """What is wrong with an unknown key or option, and what to type."""
+        key = error.key
         if error.option is not None:
-            known = self.of_option(error.key, error.option)
-            return f"{error.key}={error.option}: {known}"
+            return f"{key}={error.option}: {self.of_option(key, error.option)}"
         if NO_ENV in str(error):
-            return self.without_env()
-        typed = [o for o in self.overrides if o.lstrip("+~").startswith(error.key)]
+            return self._without_env()
+        typed = [o for o in self.overrides if o.lstrip("+~").startswith(key)]
         value = typed[-1].partition("=")[2] if typed else ""
         if file := re.match(r"In '([^']*)'", str(error)):
-            line = (self.words(error.key, "") or "").split(" ")[-1].partition("=")[0]
+            line = (self.line(key, "") or "").split(" ")[-1].partition("=")[0]
             nested = ": {".join(line.split(".")) + ": …" + "}" * line.count(".")
-            if error.key in self.groups:
-                nested = f"defaults: [override /{error.key}: …]"
+            if key in self.groups:
+                nested = f"defaults: [override /{key}: …]"
             meant = f"did you mean {nested}?" if line else "see bcrl --help"
-            return f"{error.key}: unknown key in {file[1]}; {meant}"
-        if error.key in self.groups:
+            return f"{key}: unknown key in {file[1]}; {meant}"
+        if key in self.groups:
             why = "needs no +" if typed[-1][0] == "+" else "is chosen twice"
-            return f"{error.key}: {why}; {self.mean(error.key, value)}"
+            return f"{key}: {why}; {self.mean(key, value)}"
         if typed and typed[0].startswith("~"):
-            return f"{typed[0]}: there is nothing to delete; {error.key}=null"
-        keys = self.present.keys() - {"seed", "seeds"}
-        parents = [key for key in keys if error.key.startswith(f"{key}.")]
-        if parents:
-            inner = error.key.removeprefix(f"{parents[0]}.")
-            line = f"+{error.key}={value}"
-            if self.present[parents[0]] is not None or parents[0].startswith(
-                "env.tasks."
-            ):
-                line = f"'{parents[0]}=[{{{inner}: …}}, …]'"
-            why = f"{parents[0]} is {self.present[parents[0]] or 'null'}"
-            return f"{error.key}: unknown key, for {why}; did you mean {line}?"
-        return f"{error.key}: unknown key; {self.mean(error.key, value)}"
+            return f"{typed[0]}: there is nothing to delete; {key}=null"
+        for parent in self.present.keys() - {"seed", "seeds"}:
+            if key.startswith(f"{parent}."):
+                inner, there = key.removeprefix(f"{parent}."), self.present[parent]
+                line = f"+{key}={value}"
+                if there is not None or parent.startswith("env.tasks."):
+                    line = f"'{parent}=[{{{inner}: …}}, …]'"
+                why = f"unknown key, for {parent} is {there or 'null'}"
+                return f"{key}: {why}; did you mean {line}?"
+        return f"{key}: unknown key; {self.mean(key, value)}"
 
-    def without_env(self) -> str:
+    def _without_env(self) -> str:
         """What to type where no environment is chosen, perhaps by another's name."""
         for override in self.overrides:
             key, _, value = override.partition("=")
-            known = {*self.groups, *self.present, *self.brought}
-            if key not in known and not key.startswith(("+", "~", "hydra")):
-                return f"{key}: unknown key; {self.mean(key, value)}"
-            if self.brought.get(key) and key not in self.present:
-                return f"{key}: needs its env; {self.mean(key, value)}"
-        known = ", ".join(self.groups["env"])
-        return f"env: You must specify 'env', such as env=maze; known: {known}"
+            known = key in self.groups or key in self.present
+            if not known and not key.startswith(("+", "~", "hydra")):
+                why = "needs its env" if key in self.brought else "unknown key"
+                return f"{key}: {why}; {self.mean(key, value)}"
+        known_envs = ", ".join(self.groups["env"])
+        return f"env: You must specify 'env', such as env=maze; known: {known_envs}"
 
     def of_option(self, group: str, value: object) -> str:
         """`did you mean env=maze?`, and the options where they are few."""
-        if group[:3] == "env" and (line := self.gymnasium(str(value))):
-            return f"did you mean {line}?"
-        near, known = self.option(group, value), self.groups.get(group, ())
-        if near and group == "variant" and str(value).upper().endswith("-DQN"):
-            near += " algorithm=dqn"
-        if not known:
-            return f"{group} is no group; see bcrl --help"
-        listed = f"known: {', '.join(known)}" if len(known) <= 12 or not near else ""
-        said = f"did you mean {group}={near}?" if near else ""
-        return f"{said} ({listed})" if said and listed else said or listed
+        near = gymnasium(f"{group}/{value}".removeprefix("env/"))
+        near, known = near or self._choice(group, value), self.groups.get(group, ())
+        few = bool(known) and (len(known) <= 12 or not near)
+        listed = f"known: {', '.join(known)}" if few else "see bcrl --help"
+        return f"did you mean {near}? ({listed})" if near else listed
 
     def mean(self, word: str, value: str | None) -> str:
         """`did you mean env=maze?`, or where to look."""
-        line = self.words(word, value)
+        line = self.line(word, value)
         return f"did you mean {line}?" if line else "see bcrl --help"
+
+
+def gymnasium(value: str) -> str | None:
+    """`env=gymnasium env.id=CartPole-v1` for such an id."""
+    found = re.fullmatch(r"(?:gymnasium/)?([\w.:/-]+-v\d+)", value)
+    return f"env=gymnasium env.id={found[1]}" if found else None
 
 
 def numbers(key: str, value: str) -> str:
     """`seeds=5` or `seeds=[3,4,5]` for the ways in which people write ranges."""
     found = [int(number) for number in re.findall(r"\b\d{1,6}\b", value)]
-    if "range" in value and len(found) == 1:
-        return f"seeds={found[0]}"
-    dashed = re.fullmatch(
-        r"\[?(\d{1,6})\s*(-|\.\.|:|to|…)\s*(\d{1,6})\]?", value.strip()
-    )
-    if dashed or ("range" in value and len(found) == 2):
-        first, last = found
-        after = last if "range" in value or (dashed and dashed[2] == ":") else last + 1
+    is_range = "range" in value
+    if is_range or re.fullmatch(r"\[?\d+\s*(-|\.\.|:|to|…)\s*\d+\]?", value.strip()):
+        first, last = [0, 0, *found][-2:]
+        after = last if is_range or ":" in value else last + 1
         if first == 0:
             return f"seeds={after}"
-        return f"seeds=[{','.join(map(str, range(first, min(after, first + 20))))}]"
+        found = list(range(first, min(after, first + 20)))
     if len(found) > 1:
         return f"seeds=[{','.join(map(str, found))}]"
     return f"{key}={found[0]}" if found else "seeds=5 or seeds=[3,7,11]"
 
 
-def bare(words: Sequence[str]) -> Iterator[tuple[str, str | None]]:
+def _bare(words: Sequence[str]) -> Iterator[tuple[str, str | None]]:
     """The words that are no KEY=VALUE, each with the word that follows as its value."""
     for place, word in enumerate(words):
-        spaced = re.match(r"\s*([\w./]+)\s+=\s*(.*)$|=", word)
-        if spaced and spaced[1]:
+        if spaced := re.match(r"\s*([\w./]+)\s+=\s*(.*)$", word):
             yield spaced[1], spaced[2]
         if "=" in word.strip("=") or word.startswith("~"):
             continue
         after = [w for w in words[place + 1 : place + 3] if w != "="]
-        plain = after and "=" not in after[0] and not after[0].startswith("-")
-        yield word, after[0] if plain else None
+        is_value = after and "=" not in after[0] and not after[0].startswith("-")
+        yield word, after[0] if is_value else None

@@ -1,29 +1,33 @@
-"""Hydra's composition of one job, its errors made short."""
+"""Hydra's composition of one job, and what the folders of configs hold."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import re
+import time
+from datetime import datetime
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import yaml
-from hydra import compose as hydra_compose
-from hydra import initialize_config_dir
+from hydra import compose, initialize_config_dir
+from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bcrl.common.identity import flat
-from bcrl.config.bounds import check_file
-from bcrl.config.overrides import first_lines
+from bcrl.common.identity import Plain
+from bcrl.config import safety, schema
 from bcrl.errors import BcrlError, did_you_mean
 
 PACKAGE = Path(__file__).resolve().parents[1]
 #: In a wheel the configs lie inside the package, in a checkout beside it.
 CONF = next(p for p in (PACKAGE / "conf", PACKAGE.parent / "conf") if p.is_dir())
 CONFIG_NAME = "config"
-#: What Hydra says of a key that can't be overridden, added or deleted.
+STARTED = "BCRL_STARTED"  # when the command began, in its jobs' processes, too
+#: Hydra's messages about a key that can't be overridden, added or deleted.
 UNKNOWN = re.compile(
     r"Could not override '([^']+)'|Could not append.* already at '([^']+)'"
     r"|Could not delete from config\. '([^']+)' does not exist"
@@ -31,26 +35,49 @@ UNKNOWN = re.compile(
     r"|In '[^']*': ConfigKeyError .* Key '([^']+)' not in 'Config'"
 )
 NO_ENV = "You must specify 'env'"
-Folders = tuple[str, ...]  # of configs, besides our own
+Paths = tuple[str, ...]  # of folders of configs, besides our own
 
 
 class Unknown(BcrlError):
-    """A key that there isn't, or an option of a group."""
+    """An unknown key, or an unknown option of a group."""
 
     def __init__(self, text: str, key: str, option: str | None = None) -> None:
         super().__init__(text)
         self.key, self.option = key, option
 
 
-@cache
-def composed(name: str, overrides: tuple[str, ...], folders: Folders) -> DictConfig:
-    """One job's config, composed from its overrides; BcrlError says why it can't be."""
+def now(pattern: str) -> str:
+    """`${now:%H-%M}`: when the command began, one time in all of its jobs."""
+    began = float(os.environ.setdefault(STARTED, str(time.time())))
+    return datetime.fromtimestamp(began).strftime(pattern)
+
+
+def register_plugins() -> None:
+    """Make the schema known to Hydra, and how folders of configs are read."""
+    schema.register_schema()
+    for plugin in (safety.ConfigFolder, safety.OwnSearchPath):
+        Plugins.instance().register(plugin)
+    OmegaConf.register_new_resolver("now", now, replace=True)
+
+
+def searchpath(folders: Paths) -> list[str]:
+    """The override that adds folders to Hydra's search path, if there are any."""
     quoted = [folder.replace("'", r"\'") for folder in folders]
-    extra = [f"'file://{folder}'" for folder in quoted]
-    path = [f"hydra.searchpath=[{','.join(extra)}]"] if extra else []
+    places = ",".join(
+        f"'{safety.ConfigFolder.scheme()}://{folder}'" for folder in quoted
+    )
+    return [f"hydra.searchpath=[{places}]"] if folders else []
+
+
+@cache
+def composed(name: str, overrides: tuple[str, ...], folders: Paths) -> DictConfig:
+    """One job's config, composed from its overrides; BcrlError says what is wrong."""
+    register_plugins()
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
-            return hydra_compose(name, [*overrides, *path], return_hydra_config=True)
+            register_plugins()  # once more: Hydra has its own `now`
+            asked = [*overrides, *searchpath(folders)]
+            return compose(name, asked, return_hydra_config=True)
     except BcrlError:
         raise
     except MissingConfigException as error:
@@ -65,12 +92,7 @@ def composed(name: str, overrides: tuple[str, ...], folders: Folders) -> DictCon
         raise BcrlError(text) from error
     if unknown := UNKNOWN.match(message):
         key = next(filter(None, unknown.groups()))
-        if key.startswith("hydra."):
-            raise BcrlError(
-                f"{key}: unknown key; one that isn't there is added with +{key}"
-            )
-        text = message if message.startswith("In ") else f"{key}: unknown key"
-        raise Unknown(text, key)
+        raise Unknown(message if message[:3] == "In " else f"{key}: unknown key", key)
     if message.startswith(NO_ENV):
         raise Unknown(message, "env")
     raise BcrlError(message)
@@ -80,42 +102,61 @@ def _missing(error: MissingConfigException) -> BcrlError:
     group, _, option = (error.missing_cfg_file or "").rpartition("/")
     if not group or error.options is None:
         return BcrlError(first_lines(error))
-    return Unknown(
-        f"{group}={option}: {did_you_mean(option, error.options)}", group, option
+    meant = did_you_mean(option, error.options)
+    return Unknown(f"{group}={option}: {meant}", group, option)
+
+
+def plain(section: DictConfig) -> Plain:
+    """A section with its interpolations resolved, as dicts, lists and scalars."""
+    try:
+        values: Any = OmegaConf.to_container(
+            section, resolve=True, throw_on_missing=True
+        )
+    except OmegaConfBaseException as error:
+        raise BcrlError(first_lines(error)) from error
+    except RecursionError as error:
+        raise BcrlError("an interpolation, ${…}, refers to itself") from error
+    return values
+
+
+def first_lines(error: BaseException) -> str:
+    """An error's own words, without the key and type listing that OmegaConf appends."""
+    lines = str(error).strip().splitlines()
+    if not lines and error.__cause__ is not None:
+        return first_lines(error.__cause__)
+    listing = r"\s*(full_key|reference_type|object_type)"
+    text = " ".join(x.strip() for x in lines if not re.match(listing, x))
+    if error.__cause__ is not None and text.startswith("Error merging"):
+        return f"{text.split()[-1]}: {first_lines(error.__cause__)}"
+    key = next((x.split(":", 1)[1].strip() for x in lines if "full_key" in x), "")
+    text = text or type(error).__name__
+    return text if not key or key in text else f"{key}: {text}"
+
+
+def options(group: str, folders: Paths = ()) -> list[str]:
+    """The names of a group's options, ours and those of other folders."""
+    places = [folder / group for folder in (CONF, *map(Path, folders))]
+    return sorted(
+        {path.stem for place in places for path in place.glob("*.yaml")}, key=str.lower
     )
 
 
-def keys_of_options(folders: Folders) -> dict[str, dict[str, Any]]:
-    """Each key that options bring into their section: the options, and its value there.
-
-    The groups themselves are there, too, with none.
-    """
-    found: dict[str, dict[str, Any]] = {}
-    for folder in map(Path, (CONF, *folders)):
-        for place in {
-            p.parent for n in ("*", "*/*") for p in folder.glob(f"{n}/*.yaml")
-        }:
-            group = place.relative_to(folder).as_posix()
-            found.setdefault(group, {})
-            for key, values in keys_of_group(group, folders).items():
-                found[key] = values
-    return found
+def group_names(folders: Paths = ()) -> list[str]:
+    """The names of all groups, `env` and `algorithm/regressor` among them."""
+    found = set()
+    for folder in (CONF, *map(Path, folders)):
+        for path in (*folder.glob("*/*.yaml"), *folder.glob("*/*/*.yaml")):
+            found.add(path.parent.relative_to(folder).as_posix())
+    return sorted(found)
 
 
 @cache
-def keys_of_group(group: str, folders: Folders) -> dict[str, dict[str, Any]]:
-    """The same of one group."""
-    found: dict[str, dict[str, Any]] = {}
-    places = [Path(folder, group) for folder in (CONF, *folders)]
-    for path in sorted(path for place in places for path in place.glob("*.yaml")):
-        try:
-            check_file(path)
-            text = path.read_text("utf-8")
-            values = yaml.safe_load(text)
-        except (BcrlError, OSError, ValueError, yaml.YAMLError):
-            continue  # whoever chooses it will be told
-        if "@package" not in text and isinstance(values, dict):
-            for key, value in flat(values).items():
-                whole = f"{group.replace('/', '.')}.{key}"
-                found.setdefault(whole, {})[f"{group}={path.stem}"] = value
-    return found
+def read_option(group: str, name: str | None, folders: Paths = ()) -> dict[str, Any]:
+    """What an option's file says; nothing if there is none that can be read."""
+    for folder in (CONF, *map(Path, folders)):
+        path = folder / group / f"{name}.yaml"
+        with contextlib.suppress(BcrlError):  # whoever chooses it gets the error
+            safety.check_file(path)
+            found = yaml.safe_load(path.read_text("utf-8"))
+            return found if isinstance(found, dict) else {}
+    return {}

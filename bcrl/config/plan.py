@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bcrl.common import compiling
+from bcrl.common import compiling, plugins
 from bcrl.common.checks import construct, one_of
-from bcrl.common.identity import Plain, differences
+from bcrl.common.identity import Plain, differences, flat
 from bcrl.config.algorithms import algorithm
-from bcrl.config.safety import check_name
-from bcrl.config.schema import Choice, Config
+from bcrl.config.schema import Choice, Config, check_name, check_path
 from bcrl.config.variant import Composition, composition
 from bcrl.envs import Env, check_tasks
 from bcrl.envs.tasks import tasks_of
@@ -44,7 +43,9 @@ class Plan:
     lockstep: int
     device: str
     config: Plain  # resolved, whole
+    sources: str = ""  # a digest of the user's code that it runs
     command: str = ""  # what runs this plan alone, a line each if there are several
+    launched: bool = False  # whether a launcher gives it to Slurm
 
     @property
     def target(self) -> Env:
@@ -77,7 +78,7 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
 
     `known` maps a tag to the config of the same choice of groups without any value
     overridden: None to the paper's reading, "released" to the authors' code's. Where
-    the config departs from all of them, its results get a directory of their own, below
+    the config departs from all of them, its results get a separate directory, below
     the name of the `env` choice.
     """
     compiling.check()
@@ -87,7 +88,7 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
     section = config["algorithm"]
     if not isinstance(section, dict):
         raise ConfigError("algorithm", section, "must be a section with a name")
-    name = section.get("name")
+    name = str(section.get("name"))
     chosen_algorithm = algorithm(name)
     chosen = composition(config, tasks)
     stages = chosen_algorithm.stages(section, chosen)
@@ -95,7 +96,6 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
     differing = {tag: differences(config, other) for tag, other in known.items()}
     same = [tag for tag, changed in differing.items() if not changed]
     tag = same[0] if same else _short_hash(differing[None])
-    lockstep = config["seeds"]["lockstep"]
     asked = _asked(config["seeds"])
     return Plan(
         env=env,
@@ -107,21 +107,22 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
         metrics=metrics,
         asked=asked,
         seeds=part(asked, config["seeds"]["part"]),
-        lockstep=lockstep or chosen_algorithm.LOCKSTEP,
+        lockstep=config["seeds"]["lockstep"] or chosen_algorithm.LOCKSTEP,
         device=_device(config["device"], chosen_algorithm.FAMILY),
         config=config,
+        sources=plugins.fingerprint(config),
     )
 
 
 def _asked(section: Plain) -> tuple[int, ...]:
     """All seeds: so many from the first on, or those that are listed."""
-    first, count, listed = (section.get(key) for key in ("first", "count", "only"))
-    if count is not None:
-        return tuple(range(first, first + count))
+    listed = section.get("only")
+    if section.get("count") is not None:
+        return tuple(range(section["first"], section["first"] + section["count"]))
     if not listed or len(set(listed)) < len(listed):
         raise ConfigError("seeds.only", listed, "must be different seeds: seeds=[3,7]")
-    for seed in listed:
-        at_least("seeds.only", seed, 0)
+    if not (min(listed) >= 0 and max(listed) <= 2**32 and len(listed) <= 10**6):
+        raise ConfigError("seeds.only", listed, "must be from 0 to 2^32, at most 10^6")
     return tuple(sorted(listed))
 
 
@@ -172,36 +173,41 @@ def _short_hash(changed: Mapping[str, tuple[Any, Any]]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
+#: Keys with a least value, and where it matters a greatest.
+_BOUNDS = {
+    "seeds.first": (0, 2**32),
+    "seeds.count": (1, 10**6),
+    "seeds.lockstep": (1, math.inf),
+    "workers": (1, math.inf),
+    "threads": (1, math.inf),
+    "scale.max_iterations": (1, math.inf),
+    "scale.max_episodes": (1, math.inf),
+    "scale.max_steps": (1, math.inf),
+}
+
+
 def _check_outputs(config: Plain) -> None:
-    seeds, scale = config["seeds"], config["scale"]
+    """Raise ConfigError for what the keys outside of the groups can't be."""
     known = [f.name for f in dataclasses.fields(Config)]
     for key, value in config.items():
         if key not in known:
             raise ConfigError(key, value, f"unknown key; {did_you_mean(key, known)}")
     construct("curriculum", Choice, config["curriculum"])
-    at_least("seeds.first", seeds["first"], 0)
-    at_least("seeds.count", seeds["count"], 1)
-    at_least("seeds.lockstep", seeds["lockstep"], 1)
-    at_least("workers", config["workers"], 1)
-    at_least("threads", config["threads"], 1)
-    at_least("scale.max_iterations", scale["max_iterations"], 1)
-    at_least("scale.max_episodes", scale["max_episodes"], 1)
-    at_least("scale.max_steps", scale["max_steps"], 1)
-    if not config["checkpoint_every"] > 0 or config["checkpoint_every"] == math.inf:
+    values = flat(config)
+    for key, (least, most) in _BOUNDS.items():
+        value = values.get(key)
+        at_least(key, value, least)
+        if value is not None and value > most:
+            raise ConfigError(key, value, f"must be at most {most}")
+    if not 0 < config["checkpoint_every"] < math.inf:
         why = "must be a number of seconds above 0"
         raise ConfigError("checkpoint_every", config["checkpoint_every"], why)
     logger(config["logger"])
     one_of("progress", config["progress"], ["auto", "bar", "lines", "none"])
-    for key, value in (("tag", config["tag"]), ("scale.name", scale["name"])):
-        if value is not None:
-            check_name(key, value)
-    for key, value, most in (
-        ("seeds.first", seeds["first"], 2**32),
-        ("seeds.count", seeds["count"] or len(seeds["only"] or ()), 10**6),
-        ("seeds.only", max(seeds["only"] or (0,)), 2**32),
-    ):
-        if value > most:
-            raise ConfigError(key, value, f"must be at most {most}")
+    check_path("runs_dir", config["runs_dir"])
+    for key in ("tag", "scale.name"):
+        if values.get(key) is not None:
+            check_name(key, values[key])
 
 
 def _tasks(section: Plain) -> tuple[list[Env], tuple[str, ...]]:

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import pairwise
 from numbers import Integral, Real
-from typing import TypeVar
+from typing import Any
 
 from bcrl.common.checks import one_of
 from bcrl.config.variant import Composition
@@ -25,25 +25,20 @@ from bcrl.learning.transfer import Boost, Shape, StageInit, warm_start
 from bcrl.q.functions import ZERO
 from bcrl.q.quadratic import FEATURES
 
-#: A setting's type, its least value and, where there is one, its greatest.
+_COUNTS = (
+    *("iterations", "episodes", "steps", "target_update", "batch_size"),
+    *("evaluate_every", "evaluation_episodes"),
+)
+_STEPS = ("random_steps", "learning_starts", "anneal_steps")
+_PROBABILITIES = ("epsilon", "epsilon_start", "evaluation_epsilon")
+#: A setting's type, its least and its greatest value.
 BOUNDS = {
-    "iterations": (int, 1),
-    "episodes": (int, 1),
-    "steps": (int, 1),
-    "random_steps": (int, 0),
-    "learning_starts": (int, 0),
-    "epsilon": (float, 0, 1),
-    "epsilon_start": (float, 0, 1),
-    "anneal_steps": (int, 0),
-    "target_update": (int, 1),
-    "batch_size": (int, 1),
-    "evaluate_every": (int, 1),
-    "evaluation_episodes": (int, 1),
-    "evaluation_epsilon": (float, 0, 1),
+    **dict.fromkeys(_COUNTS, (Integral, 1, math.inf)),
+    **dict.fromkeys(_STEPS, (Integral, 0, math.inf)),
+    **dict.fromkeys(_PROBABILITIES, (Real, 0, 1)),
 }
-#: What a warm start passes on besides values, so that it can't differ between slots.
+#: Settings that a warm start passes on, so that they can't differ between slots.
 PASSED_ON = {FQI: ("regressor",), DQN: ("hidden", "learning_rate")}
-T = TypeVar("T", FQI, DQN)
 
 
 def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...]:
@@ -59,8 +54,9 @@ def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...
     last = learners[-1]
     warm = chosen.transfers == (warm_start,)
     if warm and chosen.target_only and all(isinstance(x, DQN) for x in learners):
-        steps = sum(learner.steps for learner in learners)
-        slots = [(chosen.order[-1], replace(last, steps=steps))]
+        steps = sum(learner.steps for learner in learners if isinstance(learner, DQN))
+        whole: Any = replace(last, steps=steps)  # type: ignore[type-var]
+        slots = [(chosen.order[-1], whole)]
     made: list[Stage] = []
     for number, (task, learner) in enumerate(slots, start=1):
         env = chosen.tasks[task]
@@ -74,7 +70,7 @@ def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...
 
 
 def capped(
-    stages: Sequence[Stage], kind: type[T], **most: int | None
+    stages: Sequence[Stage], kind: type[FQI] | type[DQN], **most: int | None
 ) -> tuple[Stage, ...]:
     """The stages with a scale's caps on the budgets of one kind of learner."""
     made = []
@@ -107,7 +103,7 @@ def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
         elif isinstance(learner, DQN):
             _check_dqn(chosen, learner, start)
         elif isinstance(learner, LSPI):
-            _check_lspi(chosen, slot, learner, start)
+            _check_slot_of_lspi(chosen, slot, learner, start)
     for one, other in pairwise(learners):
         for name in PASSED_ON.get(type(other), ()) if start.initial is not ZERO else ():
             here, there = getattr(one, name, None), getattr(other, name)
@@ -118,57 +114,59 @@ def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
 
 def _check_fqi(chosen: Composition, learner: FQI, env: Env, start: StageInit) -> None:
     _check_numbers("algorithm", learner)
-    key, regressor = "algorithm.regressor", learner.regressor
+    regressor, why = learner.regressor, ""
+    key: str = "algorithm.regressor"
+    value: Any = regressor
     if isinstance(regressor, type) or not hasattr(regressor, "fit"):
-        raise ConfigError(key, regressor, "is no regressor")
-    if not hasattr(regressor, "finite_only"):
+        why = "is no regressor"
+    elif not hasattr(regressor, "finite_only"):
         why = "is no regressor of bcrl's; Sklearn(estimator) makes one of it"
-        raise ConfigError(key, regressor, why)
-    if regressor.finite_only and not is_finite(env):
+    elif regressor.finite_only and not is_finite(env):
         why = f"needs finitely many states, which {env.name} has not"
-        raise chosen.refusal(key, regressor, why)
-    if learner.shared_data and learner.epsilon < 1:
+    elif learner.shared_data and learner.epsilon < 1:
+        key, value = "algorithm.dataset", "shared"
         why = "seeds can share data only if all are random: algorithm.epsilon must be 1"
-        raise ConfigError("algorithm.dataset", "shared", why)
-    if start.behavior is not None:
+    elif start.behavior is not None:
+        key, value = "transfer", chosen.transfer
         why = "steers step by step, FQI learns from whole episodes; use algorithm=dqn"
-        raise chosen.refusal("transfer", chosen.transfer, why)
-    if start.boost != Boost():
-        why = "is the released DQN's reading; FQI knows the paper's, boosting=on"
+    elif start.boost != Boost():
         key = "boosting" if chosen.boost else "transfer"
-        raise chosen.refusal(key, chosen.boost or chosen.transfer, why)
-    if start.shape not in (None, Shape()):
+        value = chosen.boost or chosen.transfer
+        why = "is the released DQN's reading; FQI knows the paper's, boosting=on"
+    elif start.shape not in (None, Shape()):
+        key, value = "transfer", chosen.transfer
         why = "is the released DQN's reading; FQI knows transfer=shaping"
-        raise chosen.refusal("transfer", chosen.transfer, why)
+    if why:
+        raise chosen.error(key, value, why)
 
 
 def _check_dqn(chosen: Composition, learner: DQN, start: StageInit) -> None:
     _check_numbers("algorithm", learner)
-    size, begins = learner.replay_size, learner.learning_starts
+    size, widths, why = learner.replay_size, learner.hidden, ""
+    key: str = "algorithm.replay_size"
+    value: Any = size
     if not isinstance(size, Integral) or size < learner.batch_size:
         why = f"holds less than a batch, batch_size={learner.batch_size}"
-        raise ConfigError("algorithm.replay_size", size, why)
-    if size <= begins:
-        why = f"never holds more than learning_starts={begins}, so nothing is learned"
-        raise ConfigError("algorithm.replay_size", size, why)
-    if not 0 < learner.learning_rate < math.inf:
+    elif size <= learner.learning_starts:
+        why = f"never holds more than learning_starts={learner.learning_starts}"
+    elif not 0 < learner.learning_rate < math.inf:
+        key, value = "algorithm.learning_rate", learner.learning_rate
         why = "must be a number above 0"
-        raise ConfigError("algorithm.learning_rate", learner.learning_rate, why)
-    widths = learner.hidden
-    whole = all(isinstance(w, Integral) and w >= 1 for w in widths)
-    if not widths or not whole:
+    elif not widths or not all(isinstance(w, Integral) and w >= 1 for w in widths):
+        key, value = "algorithm.hidden", list(widths)
         why = "must be a list of layer widths, each at least 1"
-        raise ConfigError("algorithm.hidden", list(widths), why)
-    if start.initial is not ZERO and chosen.transfers != (warm_start,):
+    elif start.initial is not ZERO and chosen.transfers != (warm_start,):
+        key, value = "transfer", chosen.transfer
         why = "sets `initial`, but DQN starts from networks: set `base`, `potential` "
-        raise chosen.refusal("transfer", chosen.transfer, why + "or `prior`")
+        why += "or `prior`"
+    if why:
+        raise chosen.error(key, value, why)
 
 
-def _check_lspi(
+def _check_slot_of_lspi(
     chosen: Composition, slot: int, learner: LSPI, start: StageInit
 ) -> None:
     env = chosen.slots[slot]
-    why = ""
     if getattr(env, "linear_quadratic", None) is None or not hasattr(env, "push"):
         why = "learns quadratic Q-functions of continuous actions, but "
         why += f"{env} is no linear-quadratic task"
@@ -177,24 +175,30 @@ def _check_lspi(
     elif slot:
         why = f"starts from nothing, so slot {slot + 1} would drop what the one before "
         why += "has learned: LSPI in the first slot, DQN in the others"
-    if why:
-        raise ConfigError("algorithm.learners", learner.name, why)
+    else:
+        check_lspi(learner)
+        learner.episodes_per_iteration(env)  # says whether they are whole
+        return
+    raise ConfigError("algorithm.learners", learner.name, why)
+
+
+def check_lspi(learner: LSPI) -> None:
+    """Raise ConfigError for settings of LSPI's out of bounds."""
     _check_numbers("algorithm.lspi", learner)
     one_of("algorithm.lspi.features", learner.features, FEATURES)
     if not 0 < learner.noise_std < math.inf:
         why = "must be above 0: without noise LSTDQ sees one action per state"
         raise ConfigError("algorithm.lspi.noise_std", learner.noise_std, why)
-    learner.episodes_per_iteration(env)  # says whether they are whole
 
 
 def _check_numbers(section: str, learner: FQI | DQN | LSPI) -> None:
-    for name in (f.name for f in fields(learner) if f.name in BOUNDS):
-        (kind, least, *most), value = BOUNDS[name], getattr(learner, name)
-        fits = isinstance(value, Integral if kind is int else Real)
-        fits = fits and not isinstance(value, bool) and least <= value
-        if not fits or value > max(most, default=math.inf):
-            noun = "an integer" if kind is int else "a number"
-            bounds = f"from {least} to {most[0]}" if most else f"of at least {least}"
+    for name, (kind, least, most) in BOUNDS.items():
+        value: Any = getattr(learner, name, least)
+        fits = isinstance(value, kind) and not isinstance(value, bool)
+        if not fits or not least <= value <= most:
+            noun = "an integer" if kind is Integral else "a number"
+            upper = f"from {least} to {most}"
+            bounds = upper if most < math.inf else f"of at least {least}"
             raise ConfigError(f"{section}.{name}", value, f"must be {noun} {bounds}")
 
 
@@ -202,7 +206,7 @@ def _with_data(learner: FQI, env: Env, before: Sequence[Stage]) -> FQI:
     """With new data unless the stage before had this task, whose data are kept then."""
     if not before or before[-1].env != env:
         return replace(learner, new_data=True)
-    kept = before[-1].learner
+    kept: Any = before[-1].learner
     if (learner.epsilon, learner.episodes) != (kept.epsilon, kept.episodes):
         why = "the task's data are kept, so epsilon and episodes must stay the same"
         raise ConfigError("algorithm.new_data", "task", why)

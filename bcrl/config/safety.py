@@ -1,237 +1,172 @@
-"""What a composed config may say: nothing that runs code or leads out of a folder."""
+"""A config is data: it runs no code, leads to no file outside and stays small."""
 
 from __future__ import annotations
 
-import logging
+import copy
+import os
 import re
-from collections.abc import Iterator
-from pathlib import PurePath
+from pathlib import Path
 from typing import Any
 
+import yaml
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.errors import CompactHydraException
+from hydra.plugins.config_source import ConfigResult
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from bcrl.common import plugins
-from bcrl.config.bounds import check_interpolations, dotted, references
-from bcrl.errors import ConfigError, did_you_mean
+from bcrl.common.identity import flat
+from bcrl.config import schema
+from bcrl.errors import BcrlError, ConfigError
 
-#: The keys by which Hydra instantiates.
-INSTANTIATING = {"_target_", "_args_", "_partial_", "_recursive_", "_convert_"}
-#: What a section of `hydra` may instantiate besides what is trusted.
-ALLOWED = {
-    "launcher": (
-        "hydra._internal.core_plugins.basic_launcher.BasicLauncher",
-        "hydra_plugins.hydra_joblib_launcher.joblib_launcher.JoblibLauncher",
-        "hydra_plugins.hydra_submitit_launcher.submitit_launcher.LocalLauncher",
-        "hydra_plugins.hydra_submitit_launcher.submitit_launcher.SlurmLauncher",
-    ),
-    "sweeper": ("hydra._internal.core_plugins.basic_sweeper.BasicSweeper",),
-    "callbacks": ("hydra.experimental.callbacks.LogJobReturnCallback",),
+FILE_BYTES, OVERRIDE = 256 * 1024, 10_000  # of one YAML, characters of one override
+NODES, DEPTH = 10_000, 40  # values of one YAML, levels of nested sections or brackets
+#: Aliases of a YAML and interpolations of a config: each may repeat a large value.
+REPEATS = 16
+#: The tags that JSON has, too; others make objects.
+TAGS = {None, "!"} | {
+    f"tag:yaml.org,2002:{kind}"
+    for kind in ("null", "bool", "int", "float", "str", "seq", "map")
 }
-#: Arguments of the launchers above that end in a shell.
-SHELL = {"setup", "python", "srun_args", "additional_parameters"}
-LOGGING = ("job_logging", "hydra_logging")
-#: What `logging.config.dictConfig` may be told, by the section it stands in.
-LOGGING_KEYS = {
-    "": {"version", "formatters", "handlers", "root", "loggers"}
-    | {"disable_existing_loggers", "incremental"},
-    "formatters": {"format", "datefmt", "style", "validate", "class"},
-    "handlers": {"class", "level", "formatter", "stream"}
-    | {"filename", "mode", "delay"},
-    "loggers": {"level", "handlers", "propagate"},
-    "root": {"level", "handlers"},
-}
-LOGGING_CLASSES = {
-    "formatters": ("logging.Formatter", "colorlog.ColoredFormatter"),
-    "handlers": ("logging.StreamHandler", "logging.FileHandler", "logging.NullHandler"),
-}
-#: Hydra's own; at any other place a line of a config's could be run by somebody.
-LOG_FILES = (
-    "${hydra.runtime.output_dir}/${hydra.job.name}.log",
-    "hydra-${hydra.job.name}.log",
+#: References and two resolvers that give text. Others make config out of text.
+INTERPOLATION = re.compile(
+    r"\$\{\s*(?:(?!hydra\.)\.*[\w.\[\]-]+|(?:oc\.env|now)\s*:[^${}]*)\s*\}"
 )
-STREAMS = ("ext://sys.stdout", "ext://sys.stderr")
-#: Interpolations that can only be text, wherever they lead.
-TEXTUAL = re.compile(
-    r"runs_dir|tag|workers|hydra\.(job\.(name|num|id)|run\.dir|sweep\.(dir|subdir)"
-    r"|runtime\.(output_dir|cwd))"
+#: What may differ from Hydra's defaults; `schema` checks the launcher's keys.
+ALLOWED = re.compile(
+    r"mode|sweeper\.params\b.*|launcher\b.*|searchpath|(runtime|overrides)\b.*"
+    r"|job\.(override_dirname|config_name)"
 )
-#: Environment variables that only say how much of a machine is used.
-HARMLESS = re.compile(
-    r"[A-Z]+_NUM_THREADS|OMP_(PROC_BIND|PLACES|DYNAMIC)|KMP_(AFFINITY|BLOCKTIME)"
-    r"|CUDA_(VISIBLE_DEVICES|DEVICE_ORDER)|CUBLAS_WORKSPACE_CONFIG"
-)
-PATHS = ("runs_dir", "hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
-NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{,99}")
-COMPONENT, PARTS = 200, 50  # bytes of a part of a path, and how many parts
 
 
-def check(composed: DictConfig) -> None:
-    """Raise BcrlError for whatever in a composed config could do harm once acted on."""
-    config = OmegaConf.to_container(composed, resolve=False)
-    check_interpolations(config)
-    for path, value in _everything(config):
-        if isinstance(value, dict):
-            _check_instantiation(path, value)
-    hydra = config.get("hydra") or {}
-    for section in (*ALLOWED, *LOGGING):
-        _check_text(("hydra", section), hydra.get(section))
-    for section in ("launcher", "sweeper"):
-        if "_target_" not in (hydra.get(section) or {}):
-            raise ConfigError(f"hydra.{section}", hydra.get(section), "has no _target_")
-    for section in LOGGING:
-        _check_logging(f"hydra.{section}", hydra.get(section))
-    job = hydra.get("job") or {}
-    if job.get("chdir"):
-        why = "results and checkpoints are in runs_dir, wherever a job is: chdir=false"
-        raise ConfigError("hydra.job.chdir", job["chdir"], why)
-    for key in ("env_set", "env_copy"):
-        for name in job.get(key) or ():
-            if not HARMLESS.fullmatch(str(name)):
-                why = "only variables such as OMP_NUM_THREADS and CUDA_VISIBLE_DEVICES"
-                raise ConfigError(f"hydra.job.{key}", name, why)
-    check_name("hydra.job.name", job.get("name", "bcrl"))
-    if hydra.get("output_subdir") not in (None, ".hydra"):
-        why = "only null or .hydra"
-        raise ConfigError("hydra.output_subdir", hydra["output_subdir"], why)
-    verbose = hydra.get("verbose", False)
-    if any(not isinstance(x, (bool, str)) for x in _parts(verbose)):
-        raise ConfigError("hydra.verbose", verbose, "must be true or names of loggers")
-    for key in PATHS:
-        value = _resolved(composed, key)
-        if value is not None:
-            check_path(key, str(value))
+_OURS: dict[str, ConfigResult] = {}
 
 
-def check_name(key: str, text: str) -> None:
-    """Raise ConfigError for what isn't a plain name of a file or folder."""
-    if not NAME.fullmatch(text):
-        why = "must be a plain name of at most 100 letters, digits, '.', '_' and '-'"
-        raise ConfigError(key, text[:40], why)
+class Rejected(BcrlError, CompactHydraException):
+    """Bad input that Hydra, too, reports without a traceback."""
 
 
-def check_path(key: str, text: str) -> None:
-    """Raise ConfigError for a path that isn't what it seems, or that can't be made."""
-    path = PurePath(text)
-    if not text.strip():
-        raise ConfigError(key, repr(text), "must name a folder")
-    if text.startswith("~"):
-        raise ConfigError(key, text, "~ isn't expanded; write $HOME or the whole path")
-    if ".." in path.parts and not path.is_absolute():
-        raise ConfigError(key, text, "leads out of this folder; name it absolutely")
-    if not text.isprintable() or "://" in text:
-        raise ConfigError(key, repr(text), "isn't the name of a folder")
-    longest = max((len(part.encode()) for part in path.parts), default=0)
-    if longest > COMPONENT or len(path.parts) > PARTS:
-        raise ConfigError(key, f"{text[:40]}…", "is too long for a path")
+class ConfigFolder(FileConfigSource):
+    """A folder of configs; those of the user's own are plain, small data within it."""
+
+    @staticmethod
+    def scheme() -> str:
+        """What a folder's place in the search path begins with."""
+        return "bcrl"
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """Read one file; Rejected says what is wrong with it."""
+        name = os.path.normpath(self._normalize_file_name(config_path))
+        if os.path.isabs(name) or name.startswith(".."):
+            raise Rejected(f"{config_path}: leads out of the folder {self.path}")
+        if self.provider == "main":  # ours, which every job of a sweep reads
+            place = os.path.join(self.path, name)
+            if place not in _OURS:
+                _OURS[place] = super().load_config(config_path)
+            return copy.deepcopy(_OURS[place])
+        check_file(Path(self.path, name))
+        loaded = super().load_config(config_path)
+        package = loaded.header.get("package") or os.path.dirname(name)
+        if isinstance(loaded.config, DictConfig):
+            schema.check_written(package, loaded.config)
+            if OmegaConf.select(loaded.config, "hydra.searchpath") is not None:
+                why = "only the command line names folders of configs: --config-dir"
+                raise Rejected(f"hydra.searchpath in {config_path}: {why}")
+        return loaded
 
 
-def _check_instantiation(path: tuple, mapping: dict) -> None:
-    """Raise ConfigError for an instantiation that isn't allowed where it stands."""
-    if "()" in mapping:
-        raise ConfigError(dotted((*path, "()")), mapping["()"], "is not allowed")
-    found = sorted(INSTANTIATING & mapping.keys())
-    if not found:
-        return
-    target, key = mapping.get("_target_"), dotted((*path, found[0]))
-    section = path[1] if path[:1] == ("hydra",) and len(path) > 1 else None
-    if section not in ALLOWED:
-        raise ConfigError(key, mapping[found[0]], "a config can't instantiate")
-    if isinstance(target, str) and plugins.is_trusted(target.rpartition(".")[0]):
-        made = plugins.attribute(f"{dotted(path)}._target_", target, target)
-        if plugins.is_trusted(getattr(made, "__module__", None) or ""):
-            return
-    top = len(path) == 3 if section == "callbacks" else len(path) == 2
-    if found != ["_target_"]:
-        raise ConfigError(key, mapping[found[0]], "a config can't instantiate so")
-    if not top or target not in ALLOWED[section]:
-        known = did_you_mean(str(target), ALLOWED[section])
-        why = f"isn't registered; {known}, or a module of yours in {plugins.VARIABLE}"
-        raise ConfigError(key, mapping[found[0]], why)
-    for argument in sorted(SHELL & mapping.keys()):
-        if mapping[argument]:
-            why = f"runs commands; trust the launcher's package with {plugins.VARIABLE}"
-            raise ConfigError(dotted((*path, argument)), mapping[argument], why)
-    if section == "launcher":
-        for inner, value in _everything(mapping, path):
-            if isinstance(value, str) and not re.fullmatch(r"[^\n\r;`()<>|&]*", value):
-                raise ConfigError(dotted(inner), value, "has characters of a shell")
-            if isinstance(value, str) and str(inner[-1]).endswith("folder"):
-                check_path(dotted(inner), value)
+class OwnSearchPath(SearchPathPlugin):
+    """Has our own configs read as a `ConfigFolder`, too: they lead nowhere else."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Change the place of the main configs."""
+        for place in search_path.get_path():
+            if place.provider == "main":
+                path = (place.path or "").removeprefix("file://")
+                place.path = f"{ConfigFolder.scheme()}://{path}"
 
 
-def _check_text(path: tuple, section: object) -> None:
-    """Raise ConfigError where text of a section may turn into something else."""
-    for inner, value in _everything(section, path):
-        if not isinstance(value, str):
-            continue
-        for found in references(inner, value):
-            if not TEXTUAL.fullmatch(found["key"] or ""):
-                why = f"{found[0]} isn't allowed here, only the likes of hydra.job.name"
-                raise ConfigError(dotted(inner), value, why)
-        if path[-1] in LOGGING and "://" in value and value not in STREAMS:
-            raise ConfigError(dotted(inner), value, f"only {' and '.join(STREAMS)}")
-
-
-def _check_logging(key: str, section: Any) -> None:
-    """Raise ConfigError for a logging config that names more than plain loggers."""
-    if section is None:
-        return
-    _check_keys(key, section, LOGGING_KEYS[""])
-    named = {kind: section.get(kind) or {} for kind in LOGGING_KEYS if kind}
-    if section.get("root") is not None:
-        named["root"] = {"root": section["root"]}
-    for kind, all_ in named.items():
-        _check_keys(f"{key}.{kind}", all_, None)
-        for name, settings in all_.items():
-            where = f"{key}.{name}" if kind == "root" else f"{key}.{kind}.{name}"
-            _check_keys(where, settings, LOGGING_KEYS[kind])
-            allowed = LOGGING_CLASSES.get(kind, ())
-            made = settings.get("class", next(iter(allowed), None))
-            if allowed and made not in allowed:
-                raise ConfigError(f"{where}.class", made, f"only {', '.join(allowed)}")
-            level = settings.get("level", "INFO")
-            if level not in logging.getLevelNamesMapping():
-                known = did_you_mean(str(level), logging.getLevelNamesMapping())
-                raise ConfigError(f"{where}.level", level, known)
-            for used, among in (("handlers", "handlers"), ("formatter", "formatters")):
-                for each in _parts(settings.get(used) or []):
-                    if each not in named[among]:
-                        why = did_you_mean(str(each), named[among]) or f"no {among}"
-                        raise ConfigError(f"{where}.{used}", each, why)
-            if settings.get("filename", LOG_FILES[0]) not in LOG_FILES:
-                why = f"only {' or '.join(LOG_FILES)}"
-                raise ConfigError(f"{where}.filename", settings["filename"], why)
-
-
-def _check_keys(key: str, section: object, allowed: set[str] | None) -> None:
-    """Raise ConfigError for what is no section, or has a key besides those allowed."""
-    if not isinstance(section, dict):
-        raise ConfigError(key, section, "must be a section")
-    for name in section:
-        if allowed is not None and name not in allowed:
-            why = f"isn't allowed in logging; {did_you_mean(str(name), allowed)}"
-            raise ConfigError(f"{key}.{name}", section[name], why)
-
-
-def _everything(value: Any, path: tuple = ()) -> Iterator[tuple[tuple, Any]]:
-    """Every value of a config with its path, sections and lists before their parts."""
-    yield path, value
-    if isinstance(value, (dict, list)):
-        inside = value.items() if isinstance(value, dict) else enumerate(value)
-        for key, inner in inside:
-            yield from _everything(inner, (*path, key))
-
-
-def _parts(value: Any) -> list:
-    return value if isinstance(value, list) else [value]
-
-
-def _resolved(composed: DictConfig, key: str) -> str | None:
-    """What a key resolves to, or how it is written where that's known only in a job."""
+def check_override(text: str) -> None:
+    """Raise BcrlError for an override that a parser would choke on."""
+    short = repr(text if len(text) <= 60 else text[:57] + "…")
     try:
-        return OmegaConf.select(composed, key)
-    except OmegaConfBaseException:
-        parent, _, last = key.rpartition(".")
-        inside = OmegaConf.select(composed, parent) if parent else composed
-        return OmegaConf.to_container(inside, resolve=False)[last]
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise BcrlError(f"{short} isn't valid UTF-8") from error
+    if len(text) > OVERRIDE:
+        raise BcrlError(f"{short} is longer than {OVERRIDE} characters; use a YAML")
+    opening = sum(text.count(bracket) for bracket in "[({")
+    if max(opening, text.partition("=")[0].count(".")) > DEPTH:
+        raise BcrlError(f"{short} has more than {DEPTH} brackets or nested keys")
+
+
+def check_file(path: Path) -> None:
+    """Raise Rejected for a file that isn't plain, small YAML in UTF-8."""
+    if not path.is_file():  # a pipe would never end
+        raise Rejected(f"{path} is no regular file")
+    if path.stat().st_size > FILE_BYTES:
+        raise Rejected(f"{path} is larger than {FILE_BYTES // 1024} KiB")
+    try:
+        check_yaml(path.read_text("utf-8"))
+    except UnicodeDecodeError as error:
+        raise Rejected(f"{path} isn't UTF-8: {error.reason}") from error
+    except yaml.YAMLError as error:
+        words = " ".join(str(error).split())
+        raise Rejected(f"{path} can't be read: {words}") from error
+    except BcrlError as error:
+        raise Rejected(f"{path} {error}") from error
+
+
+def check_yaml(text: str) -> None:
+    """Raise BcrlError for YAML that makes objects, is too large, or misleads."""
+    nodes = depth = aliases = 0
+    resolver = yaml.SafeLoader("")
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        nodes += isinstance(event, yaml.NodeEvent)
+        aliases += isinstance(event, yaml.AliasEvent)
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if nodes > NODES or depth > DEPTH or aliases > REPEATS:
+            most = f"{NODES} values, {DEPTH} levels and {REPEATS} aliases"
+            raise BcrlError(f"is too large: at most {most} are read")
+        if getattr(event, "tag", None) not in TAGS:
+            raise BcrlError(f"has the tag {event.tag!r}; only plain values can be read")
+        if isinstance(event, yaml.ScalarEvent) and event.implicit[0]:
+            word = event.value
+            kind = resolver.resolve(yaml.ScalarNode, word, (True, False))[-5:]
+            if kind == ":bool" and word.lower() not in ("true", "false"):
+                why = "write true or false, or quote on and off where they are names"
+                raise BcrlError(f"has a bare {word}, a truth value to YAML; {why}")
+            if kind in ("2:int", "float") and re.search("[:_xb]|^[+-]?0[0-9]", word):
+                why = "write the number that is meant in digits, or quote a name"
+                read = yaml.safe_load(word)
+                raise BcrlError(f"has a bare {word}, which YAML reads as {read}; {why}")
+
+
+def check_composed(composed: DictConfig, usual: DictConfig | None) -> None:
+    """Raise ConfigError for interpolations or keys of Hydra's that aren't allowed.
+
+    `usual` is a config with Hydra's keys at their defaults, or None where nobody could
+    have changed them.
+    """
+    config: Any = OmegaConf.to_container(composed, resolve=False)
+    hydra = flat(config.pop("hydra"))
+    if usual is not None:
+        known = flat(OmegaConf.to_container(usual.hydra, resolve=False))  # type: ignore
+        for key in sorted(hydra.keys() | known.keys()):
+            value = hydra.get(key, "absent")
+            if not ALLOWED.fullmatch(key) and value != known.get(key, "absent"):
+                why = "of Hydra's keys a config may set mode, sweeper.params, launcher"
+                raise ConfigError(f"hydra.{key}", value, why)
+    set_here = {k: v for k, v in hydra.items() if k.startswith(("launcher", "sweeper"))}
+    found = 0
+    for key, value in flat(config | {"hydra": set_here}).items():
+        for start in re.finditer(r"\$\{", text := str(value)):
+            found += 1
+            if not INTERPOLATION.match(text, start.start()):
+                why = "only ${key}, ${oc.env:NAME} and ${now:…} are allowed, not nested"
+                raise ConfigError(key, text, f"{why}, and none of Hydra's own keys")
+            if found > REPEATS:
+                why = f"a config has at most {REPEATS} interpolations"
+                raise ConfigError(key, text, why)

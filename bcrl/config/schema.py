@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, get_args, get_origin, get_type_hints
+from pathlib import PurePath
+from typing import Any, get_args, get_type_hints
 
-from hydra.conf import HydraConf
 from hydra.core.config_store import ConfigStore
-from hydra_plugins.hydra_joblib_launcher.config import JobLibLauncherConf
 from hydra_plugins.hydra_submitit_launcher.config import SlurmQueueConf
 from omegaconf import MISSING, DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from bcrl.errors import ConfigError, did_you_mean
+from bcrl.common.checks import construct
+from bcrl.common.identity import Plain, flat
+from bcrl.errors import ConfigError, at_least
 
 
 @dataclass
-class Seeds:
+class SeedsSection:
+    """Which seeds a command runs."""
+
     first: int = 0
     count: int | None = 3  # null: those of `only`
     only: list[int] | None = None
@@ -30,14 +32,18 @@ class Seeds:
 
 @dataclass
 class Scale:
+    """Caps on the budget of a slot."""
+
     name: str = MISSING
-    max_iterations: int | None = None  # caps a slot's budget
+    max_iterations: int | None = None
     max_episodes: int | None = None
     max_steps: int | None = None
 
 
 @dataclass
 class Choice:
+    """An option that has a name only."""
+
     name: str = MISSING
 
 
@@ -51,7 +57,7 @@ class Config:
     boosting: Any = MISSING
     transfer: Any = MISSING
     scale: Scale = field(default_factory=Scale)
-    seeds: Seeds = field(default_factory=Seeds)
+    seeds: SeedsSection = field(default_factory=SeedsSection)
     workers: int = 1
     threads: int | None = None
     device: str = "cpu"
@@ -63,7 +69,7 @@ class Config:
     checkpoint_every: float = 60.0
 
 
-def register() -> None:
+def register_schema() -> None:
     """Make the schema known to Hydra as `schema`."""
     ConfigStore.instance().store(name="schema", node=Config)
 
@@ -81,63 +87,103 @@ def section_of_seeds(key: str, value: object) -> dict[str, Any]:
     raise ConfigError(key, value, why)
 
 
-def seeds_of(config: Any) -> None:
-    """Write a file's `seeds: 5`, `seeds: [3, 7]` or `seed: 3` as the section's keys."""
-    there = config if isinstance(config, DictConfig) else {}
-    if None not in (there.get("seed"), there.get("seeds")):
-        raise ConfigError("seed", there["seed"], "seeds is given, too; keep one")
-    for key in ("seed", "seeds"):
-        if there.get(key) is not None:
-            value = OmegaConf.to_container(config, resolve=False).pop(key)
+def check_written(package: str, config: DictConfig) -> None:
+    """Check what a file says of seeds and texts; `seeds: 5` becomes the section's keys.
+
+    Raises ConfigError for two ways of naming seeds, and for a number where text is
+    expected: `tag: 1e3`.
+    """
+    place = "" if package == "_global_" else package.replace("/", ".") + "."
+    place = place.lstrip(".")
+    if not place and None not in (config.get("seed"), config.get("seeds")):
+        raise ConfigError("seed", config["seed"], "seeds is given, too; keep one")
+    for key in ("seed", "seeds") if not place else ():
+        if config.get(key) is not None:
+            value = OmegaConf.to_container(config, resolve=False).pop(key)  # type: ignore
             del config[key]
             config["seeds"] = section_of_seeds(key, value)
-
-
-LAUNCHERS = {"JoblibLauncher": JobLibLauncherConf, "SlurmLauncher": SlurmQueueConf}
+    values: Any = OmegaConf.to_container(config, resolve=False)
+    for key, value in flat(values).items():
+        if isinstance(value, (int, float)) and f"{place}{key}" in texts():
+            raise ConfigError(f"{place}{key}", value, "quote it where it is a name")
 
 
 @cache
 def texts() -> frozenset[str]:
-    """The keys that a schema declares as text, ours, Hydra's and its launchers'."""
-    found = {*_texts(Config, ""), *_texts(HydraConf, "hydra.")}
-    for launcher in LAUNCHERS.values():
-        found |= {*_texts(launcher, "hydra.launcher.")}
-    return frozenset(found)
+    """The keys that a schema declares as text, ours and those of Slurm's launcher."""
+
+    def of(cls: Any, prefix: str) -> set[str]:
+        hints = get_type_hints(cls)
+        own = {prefix + name for name, hint in hints.items() if _is_text(hint)}
+        inner = [(n, h) for n, h in hints.items() if dataclasses.is_dataclass(h)]
+        return own.union(*(of(hint, f"{prefix}{name}.") for name, hint in inner))
+
+    return frozenset(of(Config, "") | of(SlurmQueueConf, "hydra.launcher."))
 
 
-def _texts(cls: type, prefix: str) -> Iterator[str]:
-    for name, hint in get_type_hints(cls).items():
-        if str in (hint, *get_args(hint)) and get_origin(hint) not in (list, dict):
-            yield prefix + name
-        elif dataclasses.is_dataclass(hint):
-            yield from _texts(hint, f"{prefix}{name}.")
+def _is_text(hint: Any) -> bool:
+    return hint is str or get_args(hint) == (str, type(None))
 
 
-def check_launcher(section: DictConfig) -> None:
-    """Raise ConfigError for a launcher's unknown key, or a value of another type."""
-    values = OmegaConf.to_container(section, resolve=True)
-    schema = LAUNCHERS.get(str(values["_target_"]).rpartition(".")[2])
-    known = schema and OmegaConf.structured(schema)
-    for key, value in values.items() if schema else ():
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{,99}")
+COMPONENT, PARTS = 200, 50  # bytes of a part of a path, and how many parts
+BASIC = {"_target_": "hydra._internal.core_plugins.basic_launcher.BasicLauncher"}
+
+
+@dataclass
+class _Slurm(SlurmQueueConf):
+    seeds_per_job: int | None = None
+
+
+def check_launcher(values: Plain | None) -> None:
+    """Raise ConfigError for a launcher other than Slurm's, or a key that it can't take.
+
+    Its values end in a shell script, so no character of a shell is allowed.
+    """
+    values = {k: v for k, v in (values or {}).items() if v not in (None, [], {})}
+    if values == BASIC:
+        return
+    if values.get("_target_") != SlurmQueueConf._target_:
+        why = "can't be instantiated; hydra/launcher=slurm, or workers=2 without a "
+        why += "launcher for two of this machine's cores"
+        raise ConfigError("hydra.launcher._target_", values.get("_target_"), why)
+    construct("hydra.launcher", _Slurm, values)
+    for key, value in values.items():
         name = f"hydra.launcher.{key}"
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        least = 0 if key in ("max_num_timeout", "signal_delay_s", "verbose") else 1
-        if key == "seeds_per_job" or (value is None and key in known):
-            number, least = value is not None, 1
-        elif key not in known:
-            raise ConfigError(name, value, f"unknown key; {did_you_mean(key, known)}")
-        else:
-            try:
-                known[key] = value
-            except OmegaConfBaseException as error:
-                raise ConfigError(name, value, str(error).splitlines()[0]) from error
-        if number and (not isinstance(value, int) or value < least):
-            raise ConfigError(name, value, f"must be a whole number from {least} on")
-        if key.startswith("mem_per") and not re.fullmatch(
-            r"\d+[KMGT]?B?", str(value or 1)
-        ):
+        if key in ("setup", "additional_parameters"):
+            raise ConfigError(name, value, "runs commands; leave it out")
+        if type(value) is int:
+            zero = key in ("max_num_timeout", "signal_delay_s")
+            at_least(name, value, 0 if zero else 1)
+        if not re.fullmatch(r"[^\n\r;`()<>|&$]*", str(value)):
+            raise ConfigError(name, value, "has characters of a shell")
+        if key.startswith("mem_per") and not re.fullmatch(r"\d+[KMGT]?B?", value):
             raise ConfigError(name, value, "must be a size such as 2G or 800M")
-    delay, limit = (values.get(key) or 0 for key in ("signal_delay_s", "timeout_min"))
+        if key == "submitit_folder":
+            check_path(name, value)
+    delay, limit = (values.get(key, 0) for key in ("signal_delay_s", "timeout_min"))
     if limit and delay >= 60 * limit:
         why = f"leaves nothing of timeout_min={limit} minutes"
         raise ConfigError("hydra.launcher.signal_delay_s", delay, why)
+
+
+def check_name(key: str, text: str) -> None:
+    """Raise ConfigError for what isn't a plain name of a file or folder."""
+    if not NAME.fullmatch(text):
+        why = "must be a plain name of at most 100 letters, digits, '.', '_' and '-'"
+        raise ConfigError(key, text[:40], why)
+
+
+def check_path(key: str, text: str) -> None:
+    """Raise ConfigError for a path that leads out of this folder, or can't be made."""
+    path = PurePath(text)
+    longest = max((len(part.encode()) for part in path.parts), default=0)
+    for wrong, why in (
+        (not text.strip(), "must name a folder"),
+        (text.startswith("~"), "~ isn't expanded; write $HOME or the whole path"),
+        (".." in path.parts and not path.is_absolute(), "leads out of this folder"),
+        (not text.isprintable() or "://" in text, "isn't the name of a folder"),
+        (longest > COMPONENT or len(path.parts) > PARTS, "is too long for a path"),
+    ):
+        if wrong:
+            raise ConfigError(key, repr(text[:40]) if "~" not in text else text, why)

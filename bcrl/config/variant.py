@@ -6,11 +6,11 @@ import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
+from typing import Any
 
 from bcrl.common import plugins
 from bcrl.common.checks import construct, one_of
 from bcrl.common.identity import Plain
-from bcrl.config.schema import Choice
 from bcrl.envs import Env
 from bcrl.errors import ConfigError
 from bcrl.learning.curriculum import CURRICULA
@@ -62,7 +62,7 @@ class Composition:
         """What a later stage starts from, as far as transfers tell without training."""
         return tried(self.transfers)
 
-    def refusal(self, key: str, value: object, why: str) -> ConfigError:
+    def error(self, key: str, value: object, why: str) -> ConfigError:
         """A ConfigError that names `value` as the caller did."""
         return ConfigError(key, self.written.get(key, value), why)
 
@@ -71,23 +71,21 @@ class Composition:
         boost, transfer, start = self.boost, self.transfer, self.start
         if len(self.order) == 1 and self._chosen:
             key = "boosting" if boost else "transfer"
-            raise self.refusal(key, boost or transfer, _one_task(self.tasks[-1]))
+            raise self.error(key, boost or transfer, _one_task(self.tasks[-1]))
         if start is None:
             return
+        why, residual = "", isinstance(start.behavior, ResidualPolicy)
         if start.behavior and self.target_only:
             why = "needs an earlier task whose policy helps: curriculum=on"
-            raise self.refusal("transfer", transfer, why)
-        if isinstance(start.behavior, ResidualPolicy):
-            if getattr(self.tasks[-1], "actions", None) is None:
-                why = (
-                    "combines actions as vectors, which env.action_vectors has to name"
-                )
-                raise self.refusal("transfer", transfer, why)
-            if start.base is not ZERO:
-                why = "its Q is about its own actions, not the executed ones that a "
-                raise self.refusal(
-                    "transfer", transfer, why + "base is about: boosting=off"
-                )
+        elif residual and getattr(self.tasks[-1], "actions", None) is None:
+            why = "combines actions as vectors, which env.action_vectors has to name"
+        elif residual and start.base is not ZERO:
+            why = (
+                "its Q is about its own actions, not the executed ones that a base is "
+            )
+            why += "about: boosting=off"
+        if why:
+            raise self.error("transfer", transfer, why)
         for key, one, other in (
             ("transfer", transfer, boost),
             ("boosting", boost, transfer),
@@ -95,12 +93,14 @@ class Composition:
             rest = () if other is None else (other,)
             if one is not None and tried(rest) == start:
                 why = "has no effect: the next stage starts as it does without"
-                raise self.refusal(key, one, why)
+                raise self.error(key, one, why)
 
 
 def composition(config: Plain, tasks: list[Env]) -> Composition:
     """The groups' choices; `check` says whether they make sense together."""
-    boost, transfer = boost_of(config["boosting"]), transfer_of(config["transfer"])
+    boost = _component("boosting", config["boosting"], {"off": _Nothing, "on": Boost})
+    transfers = {"none": _Nothing, **TRANSFERS}
+    transfer = _component("transfer", config["transfer"], transfers)
     made = Composition(
         tuple(tasks),
         order_of(config["curriculum"]["name"], tasks),
@@ -124,37 +124,27 @@ def order_of(curriculum: object, tasks: Sequence[Env]) -> tuple[int, ...]:
     number of tasks to their order. Raises ConfigError for an order that is none.
     """
     n = len(tasks)
-
-    def wrong(why: str) -> ConfigError:
-        return ConfigError("curriculum", curriculum, why)
-
     if n == 1 and curriculum != "off":
-        raise wrong(_one_task(tasks[-1]))
+        raise ConfigError("curriculum", curriculum, _one_task(tasks[-1]))
     ordered = curriculum if callable(curriculum) else _curriculum(curriculum)
     try:
-        found, again = ordered(n), ordered(n)
+        found: Any = ordered(n)
+        again = ordered(n)
+        listed = isinstance(found, (list, tuple, range)) and bool not in map(
+            type, found
+        )
+        order = tuple(map(operator.index, found)) if listed else ()
+        same = list(found) == list(again)
     except Exception as error:  # whatever a function of the user's does
-        raise wrong(f"failed for {n} tasks: {type(error).__name__}: {error}") from error
-    try:
-        fits = isinstance(found, (list, tuple, range)) and not any(
-            isinstance(task, bool) for task in found
-        )
-        order = tuple(operator.index(task) for task in found) if fits else ()
-    except TypeError:
-        order = ()
-    if not order or not set(order) <= set(range(n)):
-        why = f"visits {found!r:.80}, but must return a list of {n} integers"
-        raise wrong(f"{why}, tasks from 0 to {n - 1}")
-    if len(order) != n:
-        why = f"has {len(order)} slots, budgets are lists with one entry a task"
-        raise wrong(f"{why} ({n})")
-    if list(again) != list(found):
-        raise wrong(
-            f"visits {found}, then {again}: it must depend on its argument only"
-        )
-    if n - 1 not in order:
-        why = f"visits {found}, never the target, which is task {n - 1}"
-        raise wrong(f"{why}: a run is measured in the target, so let a slot have it")
+        why = f"failed for {n} tasks: {type(error).__name__}: {error}"
+        raise ConfigError("curriculum", curriculum, why) from error
+    if len(order) != n or not set(order) <= set(range(n)) or n - 1 not in order:
+        why = f"visits {found!r:.80}, but must return a list of {n} integers from 0 to "
+        why += f"{n - 1}, one per slot, with the target, {n - 1}, among them"
+        raise ConfigError("curriculum", curriculum, why)
+    if not same:
+        why = f"visits {found}, then {again}: it must depend on its argument only"
+        raise ConfigError("curriculum", curriculum, why)
     return order
 
 
@@ -171,7 +161,7 @@ def _curriculum(name: object) -> Callable[[int], list[int]]:
             raise ConfigError("curriculum.name", name, "must be a function")
         return found
     one_of("curriculum.name", name, list(CURRICULA))
-    return CURRICULA[name]
+    return CURRICULA[str(name)]
 
 
 def _option(name: str, chosen: object) -> str:
@@ -182,35 +172,29 @@ def _option(name: str, chosen: object) -> str:
     return name
 
 
-def boost_of(section: Plain) -> Boost | None:
-    values = _named("boosting", section, ["on", "off"])
-    if section["name"] == "off":
-        construct("boosting", Choice, section)
-        return None
-    boost = construct("boosting", Boost, values)
-    one_of("boosting.greedy_on", boost.greedy_on, ["sum", "residual"])
-    one_of("boosting.maxima", boost.maxima, ["one", "two"])
-    return boost
+@dataclass(frozen=True)
+class _Nothing:
+    """`boosting=off`, `transfer=none`."""
 
 
-def transfer_of(section: Plain) -> Transfer | None:
-    """The transfer chosen besides boosting, one of ours or a trusted `module.Class`."""
-    name = section.get("name") if isinstance(section, dict) else None
-    own = [name] if isinstance(name, str) and "." in name else []
-    values = _named("transfer", section, ["none", *TRANSFERS, *own])
-    if name == "none":
-        construct("transfer", Choice, section)
-        return None
-    cls = plugins.component("transfer.name", name, name) if own else TRANSFERS[name]
-    transfer = construct("transfer", cls, values)
-    if isinstance(transfer, Shape):
-        one_of("transfer.next_state", transfer.next_state, ["stored", "before_reset"])
-    return transfer
+#: The values of switches that follow the paper or the authors' code.
+_SWITCHES = {
+    "greedy_on": ("sum", "residual"),
+    "maxima": ("one", "two"),
+    "next_state": ("stored", "before_reset"),
+}
 
 
-def _named(group: str, section: object, names: list[str]) -> Plain:
-    """A section's values besides its name, which must be one of `names`."""
+def _component(group: str, section: object, classes: Mapping[str, type]) -> Any:
+    """The transfer that a section names, one of ours or a trusted `module.Class`."""
     if not isinstance(section, dict):
         raise ConfigError(group, section, "must be a section with a name")
-    one_of(f"{group}.name", section.get("name"), names)
-    return {key: value for key, value in section.items() if key != "name"}
+    values = dict(section)
+    name = values.pop("name", None)
+    if group == "transfer" and isinstance(name, str) and "." in name:
+        return construct(group, plugins.component("transfer.name", name, name), values)
+    one_of(f"{group}.name", name, list(classes))
+    made = construct(group, classes[name], values)
+    for key in _SWITCHES.keys() & values.keys():
+        one_of(f"{group}.{key}", values[key], _SWITCHES[key])
+    return None if isinstance(made, _Nothing) else made

@@ -20,7 +20,7 @@ Step = tuple[
     Floats, Floats, Bools
 ]  # next state (..., d), reward (...), absorbing (...)
 
-#: Rules by which an episode counts as solved: docs/gymnasium.md.
+#: Rules by which an episode counts as solved: docs/reference/gymnasium.md.
 RULES = ("absorbed", "survived", "unpunished", "rewarded", "threshold", "info")
 
 

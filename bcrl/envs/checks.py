@@ -148,7 +148,7 @@ class _Trial:
                 break
 
     def _wrong(self, why: str) -> ConfigError:
-        return ConfigError("env.name", self.name, f"{why} (docs/own.md)")
+        return ConfigError("env.name", self.name, f"{why} (docs/howto/own.md)")
 
     def _check_constants(self) -> None:
         env = self.env

@@ -41,7 +41,7 @@ class View:
     optimum: float  # V*(s0) of the *target* task, nan if unknown
 
 
-#: name in the CSV → its definition (docs/metrics.md explains them)
+#: name in the CSV → its definition (docs/reference/metrics.md explains them)
 FQI_METRICS: dict[str, Callable[[View], float]] = {
     "return": lambda view: view.returns.mean(),
     "q_error": lambda view: abs(view.q[view.reference] - view.q_star).mean(),

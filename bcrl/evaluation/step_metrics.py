@@ -18,7 +18,7 @@ from bcrl.learning.stage import StepSnapshot
 
 
 def evaluate(now: StepSnapshot, seeds: Sequence[int]) -> list[dict[str, float]]:
-    """Each seed's columns of docs/metrics.md, in the unshaped task of the stage."""
+    """Each seed's columns (docs/reference/metrics.md), in the stage's unshaped task."""
     return _evaluate(now, seeds)[0]
 
 

@@ -21,7 +21,7 @@ from bcrl.report.figures.maze import figure_3
 from bcrl.report.late import LINEAR
 from bcrl.report.load import load_runs
 from bcrl.report.page import Picture, Pictures, page
-from bcrl.report.sweeps import groups, sweep_report
+from bcrl.report.sweeps import groups, sweep_report, sweep_table
 from bcrl.report.tables import aggregate
 from bcrl.report.variants import COMPARED, Runs, env_title
 from bcrl.results.arguments import ResultsParser
@@ -112,6 +112,8 @@ def report(
     if compared := groups(runs):
         text = sweep_report(runs, compared)
         files.append(write_text(out / f"sweep_{runs.scale}.md", text))
+        text = sweep_table(compared).to_csv(index=False, lineterminator="\n")
+        files.append(write_text(out / f"sweep_{runs.scale}.csv", text))
     agents = [
         Picture(path, f"{env_title(variant.env)}: {variant.name}")
         for variant in runs.variants

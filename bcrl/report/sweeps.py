@@ -7,10 +7,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from bcrl.common.identity import OUTPUT_KEYS, flat
 from bcrl.report.late import WINDOW, late
+from bcrl.report.statistics import bootstrap
 from bcrl.report.tables import ABSENT, Section, TextTable, mean_cell, seeds_cell
 from bcrl.report.variants import Runs, Variant
 from bcrl.results.layout import spelled
@@ -129,3 +131,27 @@ def sweep_report(runs: Runs, found: list[Group]) -> str:
         parts.append("## Notes on these runs\n")
         parts.append("\n".join(f"- {text}" for text in odd) + "\n")
     return "\n".join(parts)
+
+
+def sweep_table(found: list[Group]) -> pd.DataFrame:
+    """One row per variant: settings as JSON text, seeds, means and their intervals."""
+    rows = []
+    for group in found:
+        for variant in group.variants:
+            settings = zip(group.keys, group.settings[variant.name], strict=True)
+            row: dict[str, object] = {
+                "env": group.env,
+                "method": group.method,
+                "variant": variant.name,
+                "settings": json.dumps(dict(settings), ensure_ascii=False),
+                "seeds": spelled(variant.seeds),
+                "complete": len(variant.seeds),
+                "failed": len(variant.failed),
+            }
+            for label, values in measured(variant).items():
+                name = label.replace(" ", "_")
+                given = np.array([np.nan]) if values is None else values
+                low, high = bootstrap(given)
+                row |= {name: given.mean(), f"{name}_low": low, f"{name}_high": high}
+            rows.append(row | {"best": variant is group.best})
+    return pd.DataFrame(rows)

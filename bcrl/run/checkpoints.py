@@ -11,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from bcrl.common import plugins, serialization
+from bcrl.common import serialization
 from bcrl.common.files import write_atomically
 from bcrl.common.identity import identity
 from bcrl.config.plan import Plan
@@ -101,6 +101,7 @@ def _about(plan: Plan) -> dict[str, Any]:
     return {
         "schema": _SCHEMA,
         "code": _code(),
+        "sources": plan.sources,
         "config": hashlib.sha256(config.encode()).hexdigest(),
         "device": plan.device,
     }
@@ -112,10 +113,9 @@ def _fingerprint(sources: Iterable[Path]) -> bytes:
 
 @cache
 def _code() -> str:
-    """A hash of everything that computes: our code, the user's, libraries."""
+    """A hash of this package's code and of the libraries that compute."""
     versions = repr([version(name) for name in LIBRARIES]).encode()
-    parts = (_OURS, _fingerprint(plugins.sources()), versions)
-    return hashlib.sha256(b"".join(parts)).hexdigest()
+    return hashlib.sha256(_OURS + versions).hexdigest()
 
 
 #: Taken at the start: a file may change on disk while the loaded code stays.

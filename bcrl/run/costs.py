@@ -1,4 +1,4 @@
-"""The costs of a run: the model of docs/scaling.md, by environment and variant."""
+"""The cost model of docs/explanation/cost.md, by environment and variant."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from bcrl.common.identity import Plain
 from bcrl.common.terminal import aligned
-from bcrl.config import vetting
+from bcrl.config import jobs
 from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
 from bcrl.results.layout import (
@@ -56,13 +56,13 @@ def status(arguments: Namespace) -> str:
     """
     if all(override.startswith("runs_dir=") for override in arguments.overrides):
         any_ = [*arguments.overrides, "env=maze"]  # it is a required choice
-        (plan,) = vetting.plans(Namespace(**vars(arguments) | {"overrides": any_}))
+        (plan,) = jobs.plans(Namespace(**vars(arguments) | {"overrides": any_}))
         folders = sorted(path.parent for path in plan.root.glob(f"*/*/*/{CONFIG}"))
         if not folders:
             raise BcrlError(f"runs_dir={plan.root}: holds no runs")
         asked = [(folder, _ever_requested(folder), math.nan) for folder in folders]
     else:
-        plans = merged(vetting.plans(arguments))
+        plans = merged(jobs.plans(arguments))
         asked = [(p.directory, p.seeds, costs.expected(p)) for p in plans]
     rows, total, reasons = [["", "seeds", *STATES, "done", "core min left"]], 0.0, []
     for directory, seeds, expected in asked:

@@ -41,7 +41,7 @@ GOOD = {
     "flag": [True],
 }
 BAD = {
-    "rate": ["fast", True, float("nan"), [1.0]],
+    "rate": ["fast", True, float("inf"), [1.0]],
     "old": [1.5, "4", True],
     "either": [None, 1.5],
     "kind": ["median", True, 2.0, None],
@@ -73,20 +73,20 @@ def test_another_value_is_refused_by_key_value_and_type(key):
     for value in BAD[key]:
         with pytest.raises(ConfigError) as told:
             construct("part", Part, {key: value})
-        assert f"part.{key}={value}: must be of type" in str(told.value)
+        assert (told.value.key, told.value.value) == (f"part.{key}", value)
     assert construct("part", Part, {}) == Part()
 
 
 def test_types_are_spelled_as_the_user_writes_them():
     for key, spelled in {
-        "rate": "float | None",
-        "kind": "Literal['mean', 'max', 2]",
-        "widths": "list[int]",
-        "flag": "bool",
+        "rate": "must be of type float | None",
+        "kind": "known: 2, max, mean",
+        "widths": "must be of type list[int]",
+        "flag": "must be true or false",
     }.items():
         with pytest.raises(ConfigError) as told:
             construct("part", Part, {key: object()})
-        assert str(told.value).endswith(f"must be of type {spelled}")
+        assert str(told.value).endswith(spelled)
 
 
 def test_types_that_only_a_type_checker_can_find_are_not_checked():
@@ -99,9 +99,9 @@ def test_types_that_only_a_type_checker_can_find_are_not_checked():
         construct("part", Lazy, {"valeu": 1})
 
 
-def test_only_files_that_are_there_count_as_trusted_sources(tmp_path, monkeypatch):
+def test_only_files_that_are_there_count_as_sources(tmp_path, monkeypatch):
     (tmp_path / "fails").mkdir()
     (tmp_path / "fails" / "__init__.py").write_text("raise RuntimeError('no luck')\n")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setenv("BCRL_TRUST", "math,sys,fails.inside,no_such_module")
-    assert all(path.is_file() for path in plugins.sources())
+    for name, digits in (("math.x", 64), ("fails.inside", 64), ("maze", 0)):
+        assert len(plugins.fingerprint({"env": {"name": name}})) == digits

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from bcrl.config import vetting
+from bcrl.config import jobs
+from bcrl.config.hydra_compose import CONF
 from bcrl.errors import BcrlError
 from bcrl.learning.curriculum import CURRICULA
 from bcrl.learning.dqn import DQN
@@ -15,9 +16,9 @@ from bcrl.learning.transfer import Boost, PolicyReuse, ResidualPolicy, Shape, wa
 from tests.conftest import plan, plans
 
 GROUPS = {
-    group: sorted(p.stem for p in (vetting.CONF / group).glob("*.yaml"))
+    group: sorted(p.stem for p in (CONF / group).glob("*.yaml"))
     for group in (
-        *vetting.VARIANT_GROUPS,
+        *jobs.VARIANT_GROUPS,
         "algorithm/regressor",
         "budget",
         "variant",
@@ -25,7 +26,7 @@ GROUPS = {
     )
 }
 #: What stands by itself; the other env wants an id (tests/test_gymnasium.py).
-ENVS = [env for env in GROUPS["env"] if env != vetting.OPEN]
+ENVS = [env for env in GROUPS["env"] if env != jobs.OPEN]
 
 
 @pytest.mark.parametrize(
@@ -37,7 +38,7 @@ ENVS = [env for env in GROUPS["env"] if env != vetting.OPEN]
         ("on", "on", "BC-FQI", Boost()),
     ],
 )
-@pytest.mark.parametrize("env", ENVS)
+@pytest.mark.parametrize("env", ["car_on_hill", "maze"])
 def test_variants_are_named_by_what_they_are(env, curriculum, boosting, name, transfer):
     p = plan(f"env={env}", f"curriculum={curriculum}", f"boosting={boosting}")
     assert p.name == name and {s.transfers for s in p.stages} == {(transfer,)}
@@ -96,7 +97,7 @@ def test_a_composition_of_ones_own_gets_a_directory_of_its_own():
 
 def test_options_of_ones_own_never_pass_for_the_shipped_ones(tmp_path, monkeypatch):
     (tmp_path / "algorithm").mkdir()
-    shipped = (vetting.CONF / "algorithm" / "fqi.yaml").read_text()
+    shipped = (CONF / "algorithm" / "fqi.yaml").read_text()
     big = shipped.replace("- regressor: forest", "- regressor: sklearn_forest")
     (tmp_path / "algorithm" / "big.yaml").write_text(big)
     (own,) = plans("env=maze", "algorithm=big", config_dir=str(tmp_path))
@@ -127,16 +128,16 @@ def test_an_experiment_is_its_figures_sweep():
     assert {p.name for p in sweep} == names
 
 
-def outcome(overrides) -> str:
-    """How a composition ends; anything but a plan or a reasoned refusal propagates."""
+def outcome(*overrides: str) -> str:
+    """How a composition ends; any error but a reasoned rejection propagates."""
     try:
         return " ".join(p.name for p in plans(*overrides))
     except BcrlError as error:
         assert "=" in str(error) and len(str(error)) > 20, str(error)
-        return "refused"
+        return "rejected"
 
 
-def sensible(env: str, algorithm: str, curriculum: str, boosting: str, transfer: str):
+def sensible(algorithm: str, curriculum: str, boosting: str, transfer: str) -> bool:
     """Whether docs/architecture.md says that this combination runs."""
     steered = transfer in ("policy_reuse", "residual_policy")
     if steered and curriculum == "off":
@@ -148,43 +149,50 @@ def sensible(env: str, algorithm: str, curriculum: str, boosting: str, transfer:
     return True
 
 
-@pytest.mark.parametrize("env", ENVS)
-@pytest.mark.parametrize("algorithm", GROUPS["algorithm"])
-def test_every_combination_composes_or_is_refused_with_a_reason(env, algorithm):
+@pytest.mark.parametrize(
+    ("env", "algorithm"),
+    [
+        (env, algorithm)
+        if env == "linear_system" and algorithm == "dqn"
+        else pytest.param(env, algorithm, marks=pytest.mark.slow)
+        for env in ENVS
+        for algorithm in GROUPS["algorithm"]
+    ],
+)
+def test_every_combination_composes_or_is_rejected_with_a_reason(env, algorithm):
+    """The rule book's test (test_rule_book.py) has all of them without composing."""
     groups = ("curriculum", "boosting", "transfer")
     names = {}
     for options in itertools.product(*(GROUPS[g] for g in groups)):
         chosen = [f"{g}={o}" for g, o in zip(groups, options, strict=True)]
-        ended = outcome([f"env={env}", f"algorithm={algorithm}", *chosen])
-        assert (ended != "refused") == sensible(env, algorithm, *options), options
+        ended = outcome(f"env={env}", f"algorithm={algorithm}", *chosen)
+        assert (ended != "rejected") == sensible(algorithm, *options), options
         names.setdefault(ended, []).append(options)
-    del names["refused"]
-    # A name means one thing, and a mixture of readings has a directory of its own.
+    del names["rejected"]
+    # A name means one thing, and a mixture of readings has a separate directory.
     assert all(len(options) == 1 for options in names.values()), names
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", ENVS)
-def test_every_regressor_and_budget_composes_or_is_refused_with_a_reason(env):
-    for regressor, scale in itertools.product(
-        GROUPS["algorithm/regressor"], GROUPS["scale"]
-    ):
-        ended = outcome(
-            [f"env={env}", f"algorithm/regressor={regressor}", f"scale={scale}"]
-        )
-        assert (ended == "refused") == (regressor == "tabular" and env != "maze")
+def test_every_regressor_and_budget_composes_or_is_rejected_with_a_reason(env):
+    for regressor in GROUPS["algorithm/regressor"]:
+        ended = outcome(f"env={env}", f"algorithm/regressor={regressor}")
+        assert (ended == "rejected") == (regressor == "tabular" and env != "maze")
     n_tasks = len(plan(f"env={env}").tasks)
     for budget in GROUPS["budget"]:
         algorithm = budget.rsplit("_", 1)[1]
-        ended = outcome([f"env={env}", f"algorithm={algorithm}", f"budget={budget}"])
-        values = yaml.safe_load((vetting.CONF / f"budget/{budget}.yaml").read_text())
+        ended = outcome(f"env={env}", f"algorithm={algorithm}", f"budget={budget}")
+        values = yaml.safe_load((CONF / f"budget/{budget}.yaml").read_text())
         lengths = {len(value) for value in values.values() if isinstance(value, list)}
-        assert (ended != "refused") == (lengths <= {n_tasks}), budget
+        assert (ended != "rejected") == (lengths <= {n_tasks}), budget
 
 
-@pytest.mark.parametrize("experiment", GROUPS["experiment"])
-def test_every_experiment_composes_at_every_scale(experiment):
-    for scale in GROUPS["scale"]:
-        assert outcome([f"experiment={experiment}", f"scale={scale}"]) != "refused"
+@pytest.mark.slow
+def test_every_experiment_composes_at_every_scale():
+    for experiment in GROUPS["experiment"]:
+        for scale in GROUPS["scale"]:
+            assert outcome(f"experiment={experiment}", f"scale={scale}") != "rejected"
 
 
 DQN_VARIANTS = {
@@ -250,13 +258,13 @@ def test_a_users_folder_adds_options_of_its_own(tmp_path):
     text = "# @package _global_\ndefaults:\n  - override /env: maze\ntag: mine\n"
     (tmp_path / "experiment" / "mine.yaml").write_text(text)
     (tmp_path / "env").mkdir()
-    shipped = (vetting.CONF / "env" / "maze.yaml").read_text()
+    shipped = (CONF / "env" / "maze.yaml").read_text()
     low = shipped.replace("0.85, 0.95]", "0.85, 0.9]")
     (tmp_path / "env" / "low_maze.yaml").write_text(low)
     (own,) = plans("experiment=mine", config_dir=str(tmp_path))
     assert own.name == "FQI@mine"
     (tmp_path / "budget").mkdir()
-    budget = (vetting.CONF / "budget" / "maze_fqi.yaml").read_text()
+    budget = (CONF / "budget" / "maze_fqi.yaml").read_text()
     (tmp_path / "budget" / "low_maze_fqi.yaml").write_text(budget)
     (low_maze,) = plans("env=low_maze", "curriculum=on", config_dir=str(tmp_path))
     assert low_maze.directory == Path("runs/quick/low_maze/C-FQI")

@@ -2,15 +2,16 @@
 
 import itertools
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pytest
 import yaml
 
 from bcrl import api
+from bcrl.config import jobs
 from bcrl.config import plan as compose
-from bcrl.config import vetting
-from bcrl.config.hydra_compose import CONFIG_NAME, composed
+from bcrl.config.hydra_compose import CONF, CONFIG_NAME, composed
 from bcrl.errors import ConfigError
 from bcrl.learning.curriculum import CURRICULA
 from bcrl.learning.lspi import LSPI
@@ -33,11 +34,11 @@ from tests.toys import OpenCorridor
 
 def options(group: str) -> dict[str, dict]:
     """The options of a group, by name, as their files say."""
-    paths = sorted((vetting.CONF / group).glob("*.yaml"))
+    paths = sorted((CONF / group).glob("*.yaml"))
     return {path.stem: yaml.safe_load(path.read_text()) for path in paths}
 
 
-#: What is chosen besides env and algorithm; an option added to conf/ is covered, too.
+#: The choices besides env and algorithm; an option added to conf/ is covered, too.
 CHOICES = [options(group) for group in ("curriculum", "boosting", "transfer")]
 #: What an algorithm's own section may say of learners and regressors.
 OWN = {
@@ -47,16 +48,17 @@ OWN = {
 }
 
 
+@cache
 def settled(env: str, algorithm: str) -> dict:
     """A composed config of the pair, resolved."""
-    named = ("env.id=CartPole-v1",) if env == vetting.OPEN else ()
-    return vetting._plain(
+    named = ("env.id=CartPole-v1",) if env == jobs.OPEN else ()
+    return jobs._plain(
         composed(CONFIG_NAME, (f"env={env}", f"algorithm={algorithm}", *named), ())
     )
 
 
 def outcome(make, *arguments, **options):
-    """The stages, or the key and the reason of the refusal."""
+    """The stages, or the key and the reason of the rejection."""
     try:
         return make(*arguments, **options)
     except ConfigError as error:
@@ -129,7 +131,7 @@ def dqn(section, curriculum, tasks, transfers):
 
 @pytest.mark.parametrize("algorithm", options("algorithm"))
 @pytest.mark.parametrize("env", options("env"))
-def test_all_combinations_of_groups_give_the_same_course_or_refusal(
+def test_all_combinations_of_groups_give_the_same_course_or_rejection(
     env, algorithm, monkeypatch
 ):
     config, seen = settled(env, algorithm), set()
@@ -146,23 +148,21 @@ def test_all_combinations_of_groups_give_the_same_course_or_refusal(
         found = outcome(by_command, asked)
         assert found == outcome(by_api, asked), (own, chosen)
         seen.add(type(found[-1]))
-    assert len(seen) == 2  # both happened: courses and refusals
+    assert len(seen) == 2  # both happened: courses and rejections
 
 
 @pytest.mark.parametrize("algorithm", ["fqi", "dqn"])
-@pytest.mark.parametrize("transfer", ["none", "shaping"])
-@pytest.mark.parametrize("order", [[0, 0, 2], [2, 2, 2], [2, 0, 2], [2, 1, 0], [0, 1]])
-def test_an_order_of_ones_own_is_the_same_in_both(
-    order, transfer, algorithm, monkeypatch
-):
-    monkeypatch.setitem(CURRICULA, "mine", lambda n: order)
-    chosen = {"curriculum": {"name": "mine"}, "transfer": CHOICES[2][transfer]}
-    config = settled("car_on_hill", algorithm) | chosen
-    found = outcome(by_command, config)
-    assert found == outcome(by_api, config)
-    if len(order) == 3:
-        made = compose.plan(config, {None: config}, "car_on_hill")
-        assert ("C-" in made.variant or "SC" in made.variant) == (len(set(order)) > 1)
+def test_an_order_of_ones_own_is_the_same_in_both(algorithm, monkeypatch):
+    orders = ([0, 0, 2], [2, 2, 2], [2, 0, 2], [2, 1, 0], [0, 1])
+    for order, transfer in itertools.product(orders, ("none", "shaping")):
+        monkeypatch.setitem(CURRICULA, "mine", lambda n, order=order: order)
+        chosen = {"curriculum": {"name": "mine"}, "transfer": CHOICES[2][transfer]}
+        config = settled("car_on_hill", algorithm) | chosen
+        assert outcome(by_command, config) == outcome(by_api, config)
+        if len(order) == 3:
+            made = compose.plan(config, {None: config}, "car_on_hill")
+            named = "C-" in made.variant or "SC" in made.variant
+            assert named == (len(set(order)) > 1)
 
 
 @pytest.mark.parametrize(
@@ -174,7 +174,7 @@ def test_an_order_of_ones_own_is_the_same_in_both(
     ],
     ids=lambda order: str(order)[:20],
 )
-def test_a_curriculum_that_is_none_is_refused_in_both(order, monkeypatch):
+def test_a_curriculum_that_is_none_is_rejected_in_both(order, monkeypatch):
     """Out of range, too short or long, never at the target, no list of integers."""
 
     def mine(n):
@@ -182,8 +182,8 @@ def test_a_curriculum_that_is_none_is_refused_in_both(order, monkeypatch):
 
     monkeypatch.setitem(CURRICULA, "mine", mine)
     config = settled("car_on_hill", "fqi") | {"curriculum": {"name": "mine"}}
-    refused = [outcome(make, config) for make in (by_command, by_api)]
-    assert refused[0][0] == "curriculum" and refused[0] == refused[1]
+    rejected = [outcome(make, config) for make in (by_command, by_api)]
+    assert rejected[0][0] == "curriculum" and rejected[0] == rejected[1]
 
 
 def test_a_curriculum_has_no_moods():
@@ -227,7 +227,7 @@ B, SHAPE, RPL, PPR = Boost(), Shape(), ResidualPolicy(), PolicyReuse()
 LEARNED = StageResult(ZERO, ZERO)
 DEEP, LINEAR = api.DQN(), [api.LinearSystem("lq", horizon=100), api.LinearSystem()]
 REUSED = [replace(LINEAR[0], horizon=100)] * 2
-REFUSED = {
+REJECTED = {
     "nothing to reuse": (LINEAR[1:] * 2, DEEP, (PPR,), "transfer"),
     "nothing to add to": (LINEAR[1:] * 2, DEEP, (RPL,), "transfer"),
     "two meanings of an action": (LINEAR, DEEP, (B, RPL), "transfer"),
@@ -278,12 +278,12 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_a_script_is_refused_what_makes_no_sense(case):
-    tasks, learners, transfers, key = REFUSED[case]
-    with pytest.raises(ConfigError) as refusal:
+@pytest.mark.parametrize("case", REJECTED)
+def test_a_script_is_rejected_what_makes_no_sense(case):
+    tasks, learners, transfers, key = REJECTED[case]
+    with pytest.raises(ConfigError) as rejection:
         api.stages(tasks, learners, *transfers)
-    assert refusal.value.key == key
+    assert rejection.value.key == key
 
 
 def test_numbers_of_numpy_are_numbers():
@@ -292,7 +292,7 @@ def test_numbers_of_numpy_are_numbers():
 
 
 def test_one_of_several_lspi_stages_would_forget_the_others():
-    """Written out in a config it is refused; left to `auto` only the first is LSPI."""
+    """Written out in a config it is rejected; left to `auto` only the first is LSPI."""
     lq = ("env=linear_system", "algorithm=dqn", "boosting=on")
     lq += ("env.tasks.task=[lq,lq]", "env.tasks.horizon=[100,120]")
     lq += ("algorithm.steps=[2000,2400]", "algorithm.evaluation_episodes=5")
@@ -302,7 +302,7 @@ def test_one_of_several_lspi_stages_would_forget_the_others():
     assert [stage.learner.name for stage in made.stages] == ["lspi", "dqn"]
 
 
-# --- transfers of one's own ---
+# --- a user's transfers ---
 
 
 @dataclass(frozen=True)
@@ -357,7 +357,7 @@ def test_a_transfer_of_ones_own_that_acts_needs_no_random_steps():
     assert {s.learner.random_steps for s in shaped} == {500}
 
 
-def test_what_is_no_start_is_refused_during_a_run_as_well():
+def test_what_is_no_start_is_rejected_during_a_run_as_well():
     @dataclass(frozen=True)
     class Late:
         def __call__(self, start, previous):

@@ -8,11 +8,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def shown(name: str, tmp_path: Path) -> pd.DataFrame:
-    """The table that an example prints, its first columns as the index."""
+def lines(name: str, tmp_path: Path) -> list[list[str]]:
+    """The cells of each line that an example prints."""
     done = subprocess.run(
         [sys.executable, EXAMPLES / f"{name}.py"],
         cwd=tmp_path,
@@ -22,17 +22,40 @@ def shown(name: str, tmp_path: Path) -> pd.DataFrame:
     )
     assert done.returncode == 0, done.stderr
     assert not list(tmp_path.iterdir())  # a script leaves no files
-    lines = done.stdout.splitlines()
-    cells = [line.split() for line in lines[2:]]
+    return [line.split() for line in done.stdout.splitlines()]
+
+
+def shown(name: str, tmp_path: Path) -> pd.DataFrame:
+    """The frame that an example prints, its first columns as the index."""
+    cells = lines(name, tmp_path)[2:]
     width = max(map(len, cells))
     return pd.DataFrame([row + [""] * (width - len(row)) for row in cells]).set_index(0)
 
 
 def test_all_examples_are_tested():
     names = {path.stem for path in EXAMPLES.glob("*.py")}
-    assert names == {"own_env", "own_curriculum", "own_regressor"}
+    own = {"own_env", "own_curriculum", "own_regressor"}
+    assert names == own | {"minimal_bc_fqi", "minimal_sbc_dqn"}
 
 
+@pytest.mark.slow
+def test_the_minimal_bc_fqi_beats_fqi_in_the_target_task(tmp_path):
+    rows = lines("minimal_bc_fqi", tmp_path)[1:]
+    returns = {tuple(row[:2]): float(row[2]) for row in rows}
+    assert len(returns) == 4
+    assert returns["BC-FQI", "1.2"] > returns["FQI", "1.2"] + 0.1
+
+
+@pytest.mark.slow
+def test_the_minimal_sbc_dqn_arrives_where_dqn_does_not(tmp_path):
+    rows = lines("minimal_sbc_dqn", tmp_path)[1:]
+    returns = {tuple(row[:2]): float(row[2]) for row in rows}
+    assert len(returns) == 8
+    assert returns["DQN", "8000"] == -150.0
+    assert returns["SBC-DQN", "8000"] > -120.0
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["own_env", "own_curriculum"])
 def test_boosting_through_the_curriculum_beats_learning_from_scratch(name, tmp_path):
     solved = shown(name, tmp_path)[2].astype(float)
@@ -41,6 +64,7 @@ def test_boosting_through_the_curriculum_beats_learning_from_scratch(name, tmp_p
     assert solved["BC-FQI"] >= solved["C-FQI"]
 
 
+@pytest.mark.slow
 def test_any_regressor_of_scikit_learn_fits_residuals(tmp_path):
     table = shown("own_regressor", tmp_path)
     returns = table.loc[["RBF", "forest"], 3].astype(float)  # of the first task

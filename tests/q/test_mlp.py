@@ -137,7 +137,7 @@ def test_an_update_uses_the_current_target_and_the_current_rows(way):
     for step in range(steps):
         if step in (3, 6):
             deep.copy_target()
-            replay.forget()
+            replay.invalidate()
         if step == 5:  # the oldest rows are overwritten, the rest of the ring too
             for i in range(replay.capacity):
                 cut = np.cumsum([D, D, A, 1, 1])

@@ -371,6 +371,9 @@ def test_variants_of_fqi_and_failed_seeds(tmp_path):
     reseal(path, status="failed: non-finite weights at step 3")
     assert run(tmp_path, "--allow-incomplete", "--figures", "1") == 0
     text = (tmp_path / "figures/sweep_smoke.md").read_text()
+    table = pd.read_csv(tmp_path / "figures/sweep_smoke.csv").set_index("variant")
+    assert table["last_return"].to_dict() == {"FQI": -5.0, "FQI@trees100": -3.0}
+    assert table["late_return"].isna().all() and table["best"].tolist() == [False, True]
     returns = "– | **−3.000 [−3.000, −3.000]** | – |"
     assert f"| FQI@trees100 | 100 | 0–1 · 2 (1 failed) | {returns}" in text
     assert 'seed_0002.json says "failed: non-finite weights at step 3"' in text

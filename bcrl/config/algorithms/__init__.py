@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Collection
 from types import ModuleType
+from typing import Any
 
 from bcrl.common import plugins
+from bcrl.common.identity import Plain
 from bcrl.errors import ConfigError, did_you_mean
 
 
 def algorithm(name: str) -> ModuleType:
-    """The module of this package called `name`; ConfigError if there is none.
+    """The module of this package called `name`, or a trusted one of the user's.
 
     It has `FAMILY` (how its runs are measured: "FQI" or "DQN"), `LOCKSTEP` (how many
-    seeds it likes to train together) and `stages(section, composition)`. Others are
-    modules of the user's own, as BCRL_TRUST allows.
+    seeds it likes to train together) and `stages(section, composition)`. Raises
+    ConfigError for an unknown name.
     """
     names = [module.name for module in pkgutil.iter_modules(__path__)]
     if isinstance(name, str) and plugins.is_foreign(name, names):
@@ -25,3 +28,19 @@ def algorithm(name: str) -> ModuleType:
     if name not in names:
         raise ConfigError("algorithm.name", name, did_you_mean(str(name), names))
     return importlib.import_module(f"{__name__}.{name}")
+
+
+def per_slot(section: Plain, keys: Collection[str], n: int) -> list[dict[str, Any]]:
+    """A section's values in each of n slots; those of `keys` may be lists.
+
+    Raises ConfigError for a list whose length isn't n.
+    """
+    lists = {k: v for k, v in section.items() if k in keys and isinstance(v, list)}
+    for key, values in lists.items():
+        if len(values) != n:
+            why = f"has {len(values)} entries, but there are {n} tasks"
+            raise ConfigError(f"algorithm.{key}", values, why)
+    return [
+        section | {key: values[slot] for key, values in lists.items()}
+        for slot in range(n)
+    ]

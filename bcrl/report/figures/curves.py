@@ -19,7 +19,7 @@ POINTS = 300  # of a curve that are drawn, about
 _COLUMNS = 3  # panels beside each other
 #: What counts a family's rows, as an axis says it.
 COUNTED = {"FQI": "iteration", "DQN": "environment steps of all stages"}
-#: What an axis says of a metric (docs/metrics.md defines them); others by their names.
+#: A metric's label on an axis (docs/reference/metrics.md); others have their names.
 _LABELS = {
     ("FQI", "return"): "discounted return",
     ("FQI", "q_error"): "error, mean |Q − Q*|",

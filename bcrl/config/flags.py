@@ -1,0 +1,184 @@
+"""The command's flags, its help, and what Tab completes."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import textwrap
+from argparse import Namespace
+from collections.abc import Sequence
+from itertools import takewhile
+from pathlib import Path
+from string import Template
+from typing import NoReturn
+
+from hydra._internal.utils import get_args_parser
+from omegaconf import OmegaConf
+
+from bcrl import __version__
+from bcrl.common.files import user_folder
+from bcrl.common.identity import flat
+from bcrl.config.hydra_compose import (
+    CONFIG_NAME,
+    PACKAGE,
+    composed,
+    group_names,
+    options,
+)
+from bcrl.config.safety import check_override
+from bcrl.errors import BcrlError, closest
+
+HELP = PACKAGE / "config" / "help.txt"
+WIDTH, HANGING = 88, 21  # columns of the help, and where an option's text begins
+#: Flags of which Hydra knows nothing, or that are handed to it in another way.
+_OURS = (
+    *("describe", "dry_run", "status", "runs_dir", "overrides", "config_dir"),
+    *("help", "version"),
+)
+
+
+def arguments() -> Namespace:
+    """What the command line asks for; BcrlError for an unknown flag.
+
+    If no folder of configs is named, it is ~/.config/bcrl where that exists;
+    `unnamed` says so.
+    """
+    flags, words = flag_parser(), sys.argv[1:]
+    for place, word in enumerate(takewhile(lambda word: word != "--", words)):
+        check_override(word)
+        if word.startswith("-") and not _is_flag(word, flags):
+            raise BcrlError(f"{word}: unknown flag; {_meant(words, place, flags)}")
+    asked = flags.parse_intermixed_args()
+    if asked.runs_dir is not None:
+        quoted = asked.runs_dir.replace('"', r"\"")
+        asked.overrides.append(f'runs_dir="{quoted}"')
+    asked.unnamed = asked.config_dir is None
+    folder = asked.config_dir or own_folder()
+    asked.config_dir = os.path.abspath(folder) if folder else None
+    return asked
+
+
+def for_hydra(asked: Namespace) -> list[str]:
+    """The flags that Hydra is given."""
+    given = []
+    for action in flag_parser()._actions:
+        value = getattr(asked, action.dest, None)
+        if value and action.dest not in _OURS:
+            longest = max(action.option_strings, key=len)
+            given.append(longest if value is True else f"{longest}={value}")
+    return given
+
+
+def flag_parser() -> argparse.ArgumentParser:
+    """Hydra's flags and ours."""
+    result = get_args_parser()
+    result.prog = "bcrl"
+    shown = next(a for a in result._actions if "--version" in a.option_strings)
+    shown.version, shown.help = f"bcrl {__version__}", "show bcrl's version"  # type: ignore
+    about = "explain a key or group; without KEY, list all keys"
+    result.add_argument("--describe", metavar="KEY", nargs="?", const="", help=about)
+    result.add_argument("--dry-run", action="store_true", help="list jobs and costs")
+    result.add_argument("--runs-dir", metavar="PATH", help="as runs_dir=PATH")
+    result.add_argument("--status", action="store_true", help="list what is done")
+    result.error = _reject  # type: ignore[method-assign]
+    return result
+
+
+def _reject(message: str) -> NoReturn:
+    raise BcrlError(f"{message}; see bcrl --help")
+
+
+def _names(flags: argparse.ArgumentParser) -> list[str]:
+    """Every flag, short ones too."""
+    return [each for action in flags._actions for each in action.option_strings]
+
+
+def _is_flag(word: str, flags: argparse.ArgumentParser) -> bool:
+    """Whether a word is a flag, may be abbreviated and with its value."""
+    name, known = word.partition("=")[0], _names(flags)
+    if name.startswith("--"):
+        return any(each.startswith(name) for each in known)
+    return name in known or (
+        len(name) > 1 and all(f"-{letter}" in known for letter in name[1:])
+    )
+
+
+def _meant(words: Sequence[str], place: int, flags: argparse.ArgumentParser) -> str:
+    """What an unknown flag probably means."""
+    from bcrl.config.hints import Hints
+
+    word = words[place]
+    follow = takewhile(lambda w: "=" not in w and w[:1] != "-", words[place + 1 :])
+    value = next(follow, None)
+    if value and value.isdecimal():  # --seeds 0 1 2
+        value = " ".join([value, *takewhile(str.isdecimal, follow)])
+    chosen = tuple(each for each in words if "=" in each and not each.startswith("-"))
+    names = {name for name in _names(flags) if name[:2] == "--"}
+    names -= {"--runs-dir"}  # its key says as much
+    near = closest(word.partition("=")[0], names, 0.7)
+    line = near or Hints(chosen).line(word, value) or closest(word, names, 0.6)
+    return f"did you mean {line}?" if line else "see bcrl --help"
+
+
+def own_folder() -> Path | None:
+    """The user's folder of configs, ~/.config/bcrl, if it is there."""
+    base = user_folder("XDG_CONFIG_HOME", ".config")
+    return base / "bcrl" if base and (base / "bcrl").is_dir() else None
+
+
+def short() -> str:
+    """What `bcrl` alone shows: what it is, examples, and where to read more."""
+    title, _, rest = manual(None).partition("\n")
+    examples = rest.partition("\nExamples\n")[2].partition("\n\n")[0]
+    return f"{title}\n\n{examples}\n\nbcrl --help shows groups, keys, flags and more."
+
+
+def manual(config_dir: str | None) -> str:
+    """The help, with the options of every group, those of the user's folder too."""
+    folders = (config_dir,) if config_dir else ()
+    text = Template(HELP.read_text("utf-8"))
+    listed = {
+        name: ", ".join(options(name.replace("__", "/"), folders))
+        for name in text.get_identifiers()
+    }
+    lines = text.substitute(listed).splitlines()
+    hanging = " " * HANGING
+    wrapped = [textwrap.fill(x, WIDTH, subsequent_indent=hanging) for x in lines]
+    return "\n".join(wrapped)
+
+
+def completions(line: str) -> list[str]:
+    """What a line's last word may become: a flag, an option, a group or a key."""
+    words = line.split()[1:]
+    word = words.pop() if words and not line[-1].isspace() else ""
+    flags = flag_parser()
+    if word.startswith("-"):
+        return sorted(name for name in _names(flags) if name.startswith(word))
+    try:
+        typed, _ = flags.parse_known_intermixed_args(words)
+    except BcrlError:  # a flag's own argument is missing: the shell proposes files
+        return []
+    folder = typed.config_dir or own_folder()
+    folders = (os.path.abspath(folder),) if folder else ()
+    key, equals, value = word.partition("=")
+    if equals:
+        return [f"{key}={o}" for o in options(key, folders) if o.startswith(value)]
+    chosen = any(o.startswith(("env=", "experiment=")) for o in typed.overrides)
+    # Without an env nothing composes; most keys are the same in all of them.
+    overrides = [o for o in typed.overrides if not o.startswith("hydra.")]
+    asked = (*["env=maze"] * (not chosen), *overrides)
+    known = {
+        group: None for group in group_names(folders) if not group.startswith("tuned")
+    }
+    try:
+        job = OmegaConf.to_container(composed(CONFIG_NAME, asked, folders))
+        known |= {k: v for k, v in flat(job).items() if not k.startswith("hydra.")}  # type: ignore
+    except BcrlError:
+        pass  # the command itself says what is wrong
+    found = set()
+    for each in known:
+        if each.startswith(word):
+            step, dot, _ = each[len(word) :].partition(".")
+            found.add(f"{word}{step}{dot or '='}")
+    return sorted(found)
