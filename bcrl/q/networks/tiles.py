@@ -25,6 +25,7 @@ _NARROW = 8  # columns of the tile for what is left, or for few columns
 def _tile(vectors: int, floats: int) -> Callable:
     """An intrinsic for _ROWS rows and vectors · floats columns of a product."""
     vector, i64 = ir.VectorType(ir.FloatType(), floats), ir.IntType(64)
+    first_lane = ir.VectorType(ir.IntType(32), floats)([0] * floats)
 
     def generate(context, b, signature, args):
         out, left, right, rows, first_row, column, terms, n_terms, *strides = (
@@ -45,6 +46,7 @@ def _tile(vectors: int, floats: int) -> Callable:
         name = f"llvm.fmuladd.v{floats}f32"
         fused = cgutils.get_or_insert_function(b.module, kind, name)
         chosen = [b.load(b.gep(rows, [b.add(first_row, i64(r))])) for r in range(_ROWS)]
+        factors = [b.gep(left, [b.mul(row, across)]) for row in chosen]
         zero = vector([0.0] * floats)
         sums = [
             [cgutils.alloca_once_value(b, zero) for _ in range(vectors)] for _ in chosen
@@ -52,14 +54,13 @@ def _tile(vectors: int, floats: int) -> Callable:
         with cgutils.for_range(b, n_terms) as loop:
             term = b.load(b.gep(terms, [loop.index]))
             others = [b.load(place, align=4) for place in vectors_at(right, term)]
-            for row, row_sums in zip(chosen, sums, strict=True):
-                at = b.add(b.mul(row, across), b.mul(term, along))
-                factor = b.load(b.gep(left, [at]))
-                one = b.insert_element(vector(ir.Undefined), factor, i64(0))
-                mask = ir.VectorType(ir.IntType(32), floats)([0] * floats)
-                factors = b.shuffle_vector(one, one, mask)
+            step = b.mul(term, along)
+            for factor, row_sums in zip(factors, sums, strict=True):
+                undefined, one = vector(ir.Undefined), b.load(b.gep(factor, [step]))
+                one = b.insert_element(undefined, one, i64(0))
+                same = b.shuffle_vector(one, undefined, first_lane)
                 for other, total in zip(others, row_sums, strict=True):
-                    b.store(b.call(fused, [factors, other, b.load(total)]), total)
+                    b.store(b.call(fused, [same, other, b.load(total)]), total)
         for row, row_sums in zip(chosen, sums, strict=True):
             for place, total in zip(vectors_at(out, row), row_sums, strict=True):
                 b.store(b.load(total), place, align=4)
