@@ -30,7 +30,6 @@ def test_the_contracts_of_import_linter_hold():
     assert done.returncode == 0, done.stdout
 
 
-@pytest.mark.xfail(reason="until all packages are merged", strict=False)
 def test_no_modules_import_each_other_in_a_circle():
     """Imports within functions and for type checkers count, too."""
     grimp = pytest.importorskip("grimp")
@@ -61,7 +60,6 @@ def public_names(path: Path) -> set[str]:
     return {name for name in found if not name.startswith("_")}
 
 
-@pytest.mark.xfail(reason="until all packages are merged", strict=False)
 def test_no_public_name_has_two_meanings():
     places = defaultdict(list)
     for path in sorted(PACKAGE.rglob("*.py")):

@@ -68,7 +68,7 @@ def entries() -> list[Entry]:
     return found
 
 
-def options(group: str) -> dict[str, str]:
+def option_comments(group: str) -> dict[str, str]:
     """The options of a group, each with the comment that its file begins with."""
     found = {}
     for path in sorted(CONF.glob(f"{group}/*.yaml")):
@@ -87,7 +87,7 @@ def describe(word: str) -> str:
     if chosen := [entry for entry in known if entry.key == key]:
         return "\n".join([key, *(_block(entry, len(chosen) > 1) for entry in chosen)])
     prefix = f"{key.replace('/', '.')}." if key else ""
-    listed = options(key) if key in (*GROUPS, *SHORTHANDS) else {}
+    listed = option_comments(key) if key in (*GROUPS, *SHORTHANDS) else {}
     listed = {f"{key}={option}": text for option, text in listed.items()}
     for entry in (e for e in known if e.key.startswith(prefix)):
         listed.setdefault(entry.key, entry.parts[0].partition(". ")[0])

@@ -42,7 +42,7 @@ class View:
 
 
 #: name in the CSV → its definition (docs/reference/metrics.md explains them)
-FQI_METRICS: dict[str, Callable[[View], float]] = {
+METRICS: dict[str, Callable[[View], float]] = {
     "return": lambda view: view.returns.mean(),
     "q_error": lambda view: abs(view.q[view.reference] - view.q_star).mean(),
     "q_error_start": lambda view: abs(view.q[view.start] - view.optimum).mean(),
@@ -54,8 +54,8 @@ FQI_METRICS: dict[str, Callable[[View], float]] = {
 def check_metrics(metrics: Sequence[str], target: Env) -> None:
     """Raise ConfigError for a metric that is unknown or undefined for `target`."""
     for name in metrics:
-        if not isinstance(name, str) or name not in FQI_METRICS:
-            raise ConfigError("env.metrics", name, did_you_mean(str(name), FQI_METRICS))
+        if not isinstance(name, str) or name not in METRICS:
+            raise ConfigError("env.metrics", name, did_you_mean(str(name), METRICS))
         if name.startswith("q_error") and not oracle.has_oracle(target):
             raise ConfigError("env.metrics", name, f"no Q* of {target.name} is known")
     if "q_error_start" in metrics and len(target.evaluation_states()) != 1:
@@ -108,7 +108,7 @@ class Probe(SeedProbe):
         ):
             outcomes = (returns[s], solved[s])
             view = View(q, residual, *outcomes, start_rows, known, q_star, optimum)
-            row = {name: float(FQI_METRICS[name](view)) for name in self.metrics}
+            row = {name: float(METRICS[name](view)) for name in self.metrics}
             void = s in self.failed
             rows.append(dict.fromkeys(row, np.nan) if void else row)
         return rows

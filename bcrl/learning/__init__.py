@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from bcrl.envs.base import Floats as Floats
+
 Integers = NDArray[np.intp]
 Booleans = NDArray[np.bool_]

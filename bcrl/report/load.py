@@ -10,8 +10,8 @@ import numpy as np
 
 from bcrl.common.divergence import diverging
 from bcrl.errors import BcrlError
-from bcrl.report.notes import Note, across_methods, listed
-from bcrl.report.variants import COMPARED, Runs, Variant
+from bcrl.report.notes import across_methods, listed
+from bcrl.report.variants import COMPARED, Note, Runs, Variant
 from bcrl.results.integrity import Checked, check_tree
 from bcrl.results.layout import FQI_METRICS, INDEX, family_of
 from bcrl.results.read import BROKEN, INCOMPLETE, Finding

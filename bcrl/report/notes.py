@@ -3,39 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
+from bcrl.report.variants import Methods, Note
 from bcrl.results.layout import spelled, variant_name
-
-if TYPE_CHECKING:
-    from bcrl.report.variants import Methods
-
-
-@dataclass(frozen=True)
-class Note:
-    """One diagnostic: `text` for the terminal, `footer` (if any) for the figures.
-
-    It concerns the figures of `env` that draw the variants tagged `tag`: those with
-    `method` in them, and those that compare the methods of `family`, if one is named.
-    `incomplete`: it counts the seeds of a variant that lacks some.
-    """
-
-    text: str
-    env: str
-    tag: str | None
-    footer: str = ""
-    method: str | None = None
-    family: str | None = None
-    incomplete: bool = False
-
-    @classmethod
-    def of(cls, folder: Path, text: str, footer: str = "", **more: Any) -> Note:
-        """A note on the variant in `folder`."""
-        method, _, tag = folder.name.partition("@")
-        where = {"env": folder.parent.name, "tag": tag or None, "method": method}
-        return cls(f"{folder}: {text}", footer=footer, **where, **more)
 
 
 def listed(items: Iterable[object]) -> str:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.report.notes import Note
 from bcrl.results.layout import seed_path
 from bcrl.results.read import read_arrays
 
@@ -32,6 +31,31 @@ COMPARED = {
 _TITLES = {"car_on_hill": "Car on the hill"}
 
 Methods = Mapping[str, "Variant"]  # by the name of the method
+
+
+@dataclass(frozen=True)
+class Note:
+    """One diagnostic: `text` for the terminal, `footer` (if any) for the figures.
+
+    It concerns the figures of `env` that draw the variants tagged `tag`: those with
+    `method` in them, and those that compare the methods of `family`, if one is named.
+    `incomplete`: it counts the seeds of a variant that lacks some.
+    """
+
+    text: str
+    env: str
+    tag: str | None
+    footer: str = ""
+    method: str | None = None
+    family: str | None = None
+    incomplete: bool = False
+
+    @classmethod
+    def of(cls, folder: Path, text: str, footer: str = "", **more: Any) -> Note:
+        """A note on the variant in `folder`."""
+        method, _, tag = folder.name.partition("@")
+        where = {"env": folder.parent.name, "tag": tag or None, "method": method}
+        return cls(f"{folder}: {text}", footer=footer, **where, **more)
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ BAD = {
     "gamma": ([MAZE, "env.gamma=1.0"], ["env.gamma=1.0", "[0, 1)"]),
     "height": ([MAZE, "env.tasks.height=[0.5,1.5]"], ["env.height=1.5", "[0, 1)"]),
     "mass": (["env=car_on_hill", "env.tasks.mass=[0,1]"], ["env.mass=0"]),
-    "no tasks": ([MAZE, "env.tasks.height=[]"], ["env.tasks", "one value a task"]),
+    "no tasks": ([MAZE, "env.tasks.height=[]"], ["env.tasks", "one value per task"]),
     "trees": (
         [MAZE, "algorithm.regressor.trees=0"],
         ["regressor.trees=0", "at least 1"],

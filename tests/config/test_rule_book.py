@@ -3,6 +3,7 @@
 import itertools
 from dataclasses import dataclass, replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -361,9 +362,9 @@ def test_what_is_no_start_is_rejected_during_a_run_as_well():
     @dataclass(frozen=True)
     class Late:
         def __call__(self, start, previous):
-            return previous.q.terms
+            return previous.q.weights  # only a learned Q has some
 
     learned = begin([warm_start], None)
     assert learned == StageInit() and len(api.stages(TASKS, DEEP, Late())) == 3
     with pytest.raises(ConfigError, match="transfer"):
-        begin([Late()], replace(LEARNED, q=Sum((ZERO,))))
+        begin([Late()], replace(LEARNED, q=SimpleNamespace(weights=())))

@@ -272,7 +272,7 @@ STACK = "{name: FrameStackObservation, stack_size: 2}"
 BAD = {
     "env.id=???": "env.id",
     "env.id=CartPol-v1": "did you mean env.id=CartPole-v1?",
-    "env.id=os:CartPole-v1": "BCRL_TRUST=os",
+    "env.id=no_such:CartPole-v1": "can't be imported",
     "env.id=Pendulum-v1": "{name: DiscretizeAction",
     "env.id=tests/Endless-v0": "env.horizon",
     "env.kwargs={prise: 2.0}": "did you mean prize?",
@@ -293,7 +293,7 @@ BAD = {
     "env.wrappers=[{name: StickyAction, prob: 0.1}]": "repeat_action_probability",
     "env.wrappers=[{name: gymnasium.wrappers.RecordVideo}]": "env.wrappers=",
     "env.wrappers=[{name: gymnasium.utils.play.play}]": "env.wrappers=",
-    "env.observation=os.getcwd": "BCRL_TRUST=os",
+    "env.observation=os.nope": "os has no nope",
     "env.success=survive": "did you mean survived?",
     "env.success=threshold": "env.success_threshold",
     "env.starts=0": "env.starts",

@@ -9,7 +9,7 @@ from bcrl.envs.car_on_hill import CarOnHill
 from bcrl.envs.maze import Maze
 from bcrl.errors import ConfigError
 from bcrl.evaluation import oracle
-from bcrl.evaluation.metrics import FQI_METRICS, View, check_metrics, probed_states
+from bcrl.evaluation.metrics import METRICS, View, check_metrics, probed_states
 from bcrl.run import runner
 from tests.conftest import plan
 
@@ -25,7 +25,7 @@ def test_the_metrics_by_hand():
         q_star=np.array([[4.0, 5.0], [1.0, 0.0]]),
         optimum=10.0,
     )
-    found = {name: metric(view) for name, metric in FQI_METRICS.items()}
+    found = {name: metric(view) for name, metric in METRICS.items()}
     assert found == {
         "return": 3.0,
         "q_error": (1 + 0 + 1 + 2) / 4,

@@ -170,7 +170,7 @@ def test_a_run_without_an_episode_is_named(arrays, message, tmp_path, capsys):
 def test_a_config_names_no_code_that_is_not_trusted(tmp_path, capsys):
     write_cars(tmp_path, section=SECTION | {"name": "my_package.car"})
     assert report(tmp_path, "--gif") == 0
-    assert "isn't of this package" in capsys.readouterr().err
+    assert "a config alone can't name code" in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.gif"))
 
 

@@ -5,12 +5,14 @@ real processes; BCRL_KILLS=12 kills each of all variants so often (default: one 
 a few).
 """
 
+import itertools
 import json
 import os
 import pickle
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -118,21 +120,14 @@ def test_a_checkpoint_of_other_code_counts_as_absent(
     assert about(p, 0)["interruptions"] == 0 and not path.exists()
 
 
-def test_the_code_of_a_checkpoint_is_ours_and_the_users_at_the_start(
-    tmp_path, monkeypatch
-):
-    monkeypatch.syspath_prepend(str(tmp_path))
-    codes = []
-    for trusted, text in (("", "A = 1"), ("mine", "A = 1"), ("mine", "A = 2")):
-        (tmp_path / "mine.py").write_text(text)
-        monkeypatch.setenv("BCRL_TRUST", trusted)
-        checkpoints._code.cache_clear()
-        codes.append(checkpoints._code())
+def test_a_checkpoint_names_our_code_and_the_users(tmp_path, monkeypatch):
+    made = plan("env=maze", "scale=smoke", f"runs_dir={tmp_path}")
+    about = [checkpoints._about(replace(made, sources=x)) for x in ("", "A", "B")]
     monkeypatch.setattr(checkpoints, "_OURS", b"other sources of ours")
     checkpoints._code.cache_clear()
-    codes.append(checkpoints._code())
+    about.append(checkpoints._about(made))
     checkpoints._code.cache_clear()
-    assert len(set(codes)) == 4
+    assert all(one != other for one, other in itertools.combinations(about, 2))
 
 
 def test_other_seeds_than_a_checkpoints_start_by_themselves(tmp_path, interrupted):

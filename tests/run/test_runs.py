@@ -276,7 +276,7 @@ def test_an_unforeseen_error_shows_where_it_came_from(tmp_path, capsys, monkeypa
     with pytest.raises(runner.SeedsFailed, match=r"division by zero .*test_runs\.py:"):
         runner.run(p)
     assert "Traceback" not in capsys.readouterr().err
-    monkeypatch.setattr(Learner, "_data", lambda *_: 1 / 0)
+    monkeypatch.setattr(Learner, "_collect", lambda *_: 1 / 0)
     with pytest.raises(runner.SeedsFailed, match="ZeroDivisionError: division by zero"):
         runner.run(p)
     assert "Traceback" in capsys.readouterr().err

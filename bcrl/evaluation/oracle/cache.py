@@ -40,7 +40,7 @@ def cached(
     code = hashlib.sha256(b"".join(source.read_bytes() for source in sources))
     path = folder / f"{name}_{code.hexdigest()[:20]}.npz"
     unreadable = (OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile)
-    with contextlib.suppress(*unreadable), np.load(path) as stored:
+    with contextlib.suppress(*unreadable), np.load(path, allow_pickle=False) as stored:
         return stored["array"]
     array = compute()
     with contextlib.suppress(BcrlError):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bcrl.report.claims.judge import FEWEST_SEEDS
 from bcrl.report.claims.paper import CAR_CLAIMS, LINEAR_CLAIMS, MAZE_CLAIMS
 from bcrl.report.late import LINEAR, WINDOW, area, late
-from bcrl.report.notes import Note, incomplete, tags_shown
+from bcrl.report.notes import incomplete, tags_shown
 from bcrl.report.statistics import interquartile_mean, share_interval
 from bcrl.report.tables import (
     ABSENT,
@@ -22,7 +22,7 @@ from bcrl.report.tables import (
     number,
     seeds_cell,
 )
-from bcrl.report.variants import Methods, Runs, Variant
+from bcrl.report.variants import Methods, Note, Runs, Variant
 
 HEADER = (
     *("claim", "quantity: method, or difference of two", "expected"),
