@@ -1,27 +1,14 @@
-"""Compiled loops over lanes, and the normal quantile."""
+"""Arrays for compiled code, and the normal quantile."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.common.compiling import guvectorize
 
-
-def per_lane(signature: str, layout: str) -> Callable[[Callable], np.ufunc]:
-    """A decorator that compiles a function of one lane for arrays with leading axes.
-
-    signature: types of the arguments, outputs last, e.g. "(f8[:], f8, i8[:])"; layout:
-    their core axes, e.g. "(a),()->()". The result is a NumPy generalised ufunc, which
-    costs less per call than numba's own object around it.
-    """
-
-    def decorate(function: Callable) -> np.ufunc:
-        return guvectorize([signature], layout, cache=True)(function).ufunc
-
-    return decorate
+def writable(array: NDArray) -> NDArray[np.float64]:
+    """The array as compiled code takes it: float64, contiguous and writable."""
+    return np.require(array, np.float64, "CW")
 
 
 def ndtri(u: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -18,15 +18,12 @@ from pathlib import Path
 from typing import IO, Any
 
 import numba
-from numba import guvectorize
 from numba.core import caching
 
 from bcrl.errors import BcrlError
 
 #: A decorator like numba.njit whose compiled code is kept on disk.
 kept: Any = functools.partial(numba.njit, cache=True)
-
-__all__ = ["check", "guvectorize", "kept", "why_uncached"]
 
 _SEAL = hashlib.sha256().digest_size  # bytes at the end of a file
 

@@ -9,7 +9,8 @@ from typing import Any, ClassVar, NamedTuple
 import numba
 import numpy as np
 
-from bcrl.common.arrays import ndtri, per_lane
+from bcrl.common.arrays import ndtri, writable
+from bcrl.common.compiling import kept
 from bcrl.envs.base import Floats, Ints, Step, check_episodes
 from bcrl.errors import ConfigError, did_you_mean
 
@@ -140,15 +141,21 @@ class LinearSystem:
 
     def push(self, state: Floats, force: Floats, noise: Floats) -> Step:
         """One step with any force (..., 2); the fresh start, if any, is in `noise`."""
-        normal = ndtri(noise[..., :4])
+        rows = [_rows(x) for x in (state, force, ndtri(noise[..., :4]))]
+        lead = np.shape(state)[:-1]
         if self.task == "target":
-            return _pathway(state, force, normal, noise[..., 4:], self._dynamics)
-        after, reward = _lq(state, force, normal, self._dynamics)
-        return after, reward, np.zeros_like(reward, bool)
+            fresh = _rows(noise[..., 4:])
+            after, reward, arrived = _pathway(*rows, fresh, self._dynamics)
+        else:
+            after, reward = _lq(*rows, self._dynamics)
+            arrived = np.zeros(len(reward), bool)
+        return after.reshape(*lead, 4), reward.reshape(lead), arrived.reshape(lead)
 
     def before_reset(self, state: Floats, action: Ints, noise: Floats) -> Floats:
         """Where `step` leads before a fresh start replaces it, (..., 4)."""
-        return _move(state, ACTIONS[action], ndtri(noise[..., :4]), self._dynamics)
+        arrays = (state, ACTIONS[action], ndtri(noise[..., :4]))
+        after = _move(*map(_rows, arrays), self._dynamics)
+        return after.reshape(np.shape(state))
 
     def evaluation_states(self) -> Floats:
         """(−4, 0, 0, 0) and the corners of half the target's start box, (17, 4).
@@ -176,6 +183,11 @@ class LinearSystem:
             "start": np.concatenate([at - half, at + half]),
             "drift": np.array([self.drift, 0.0]),
         }
+
+
+def _rows(array: Floats) -> Floats:
+    """An array (..., k) as (n, k), for compiled code."""
+    return writable(array).reshape(-1, np.shape(array)[-1])
 
 
 @numba.njit
@@ -206,45 +218,40 @@ def _moved(state: Any, force: Any, normal: Any, dynamics: Any) -> Any:
     )
 
 
-@per_lane("(f8[:], f8[:], f8[:], f8[:], f8[:])", "(s),(k),(s),(c)->(s)")
-def _move(state: Any, force: Any, normal: Any, dynamics: Any, after: Any) -> None:
-    after[0], after[1], after[2], after[3] = _moved(state, force, normal, dynamics)
+@kept(nogil=True)
+def _move(state: Any, force: Any, normal: Any, dynamics: Any) -> Any:
+    after = np.empty_like(state)
+    for i in range(len(state)):
+        moved = _moved(state[i], force[i], normal[i], dynamics)
+        after[i, 0], after[i, 1], after[i, 2], after[i, 3] = moved
+    return after
 
 
-@per_lane("(f8[:], f8[:], f8[:], f8[:], f8[:], f8[:])", "(s),(k),(s),(c)->(s),()")
-def _lq(
-    state: Any, force: Any, normal: Any, dynamics: Any, after: Any, reward: Any
-) -> None:
-    """The LQ task's next state and reward."""
-    after[0], after[1], after[2], after[3] = _moved(state, force, normal, dynamics)
-    cost = ACTION_COST * (force[0] * force[0] + force[1] * force[1])
-    for i in range(4):
-        cost = cost + STATE_COST[i] * after[i] * after[i]
-    reward[0] = -cost
+@kept(nogil=True)
+def _lq(state: Any, force: Any, normal: Any, dynamics: Any) -> Any:
+    """The LQ task's next states and rewards."""
+    after, reward = _move(state, force, normal, dynamics), np.empty(len(state))
+    for i in range(len(state)):
+        cost = ACTION_COST * (force[i, 0] * force[i, 0] + force[i, 1] * force[i, 1])
+        for k in range(4):
+            cost = cost + STATE_COST[k] * after[i, k] * after[i, k]
+        reward[i] = -cost
+    return after, reward
 
 
-@per_lane(
-    "(f8[:], f8[:], f8[:], f8[:], f8[:], f8[:], f8[:], b1[:])",
-    "(s),(k),(s),(s),(c)->(s),(),()",
-)
-def _pathway(
-    state: Any,
-    force: Any,
-    normal: Any,
-    uniform: Any,
-    dynamics: Any,
-    after: Any,
-    reward: Any,
-    arrived: Any,
-) -> None:
-    """The target task's next state, reward and end; `uniform` gives a fresh start."""
-    after[0], after[1], after[2], after[3] = _moved(state, force, normal, dynamics)
-    if after[2] > PATHWAY or after[2] < -PATHWAY:
-        for i in range(4):  # as `initial`
-            after[i] = _START[i] + dynamics[5 + i] * (2.0 * uniform[i] - 1.0)
-    distance = after[0] * after[0] + after[2] * after[2]
-    arrived[0] = distance < _GOAL_RADIUS * _GOAL_RADIUS
-    reward[0] = 0.0 if arrived[0] else -1.0
+@kept(nogil=True)
+def _pathway(state: Any, force: Any, normal: Any, uniform: Any, dynamics: Any) -> Any:
+    """The target task's next states, rewards and ends; `uniform` gives fresh starts."""
+    after, reward = _move(state, force, normal, dynamics), np.empty(len(state))
+    arrived = np.empty(len(state), np.bool_)
+    for i in range(len(state)):
+        if after[i, 2] > PATHWAY or after[i, 2] < -PATHWAY:
+            for k in range(4):  # as `initial`
+                after[i, k] = _START[k] + dynamics[5 + k] * (2.0 * uniform[i, k] - 1.0)
+        distance = after[i, 0] * after[i, 0] + after[i, 2] * after[i, 2]
+        arrived[i] = distance < _GOAL_RADIUS * _GOAL_RADIUS
+        reward[i] = 0.0 if arrived[i] else -1.0
+    return after, reward, arrived
 
 
 ENV = LinearSystem

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from bcrl.common.arrays import per_lane
+from bcrl.common.arrays import writable
 from bcrl.common.compiling import kept
 from bcrl.learning import Floats, Integers
 
@@ -30,10 +30,18 @@ def _best(q, u):
     return 0
 
 
-@per_lane("(f8[:], f8, i8[:])", "(a),()->()")
-def greedy(q, u, action):
+@kept(nogil=True)
+def _best_of_each(q, u):
+    action = np.empty(len(q), np.intp)
+    for i in range(len(q)):
+        action[i] = _best(q[i], u[i])
+    return action
+
+
+def greedy(q: Floats, u: Floats) -> Integers:
     """The best action of q (..., A); ties are broken uniformly by u (...) in [0, 1)."""
-    action[0] = _best(q, u)
+    rows = writable(q).reshape(-1, q.shape[-1])
+    return _best_of_each(rows, writable(u).reshape(-1)).reshape(u.shape)
 
 
 def uniform(n_actions: int, u: Floats) -> Integers:

@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.common.arrays import per_lane
+from bcrl.common.arrays import writable
+from bcrl.common.compiling import kept
 from bcrl.common.serialization import storable
 from bcrl.q.functions import Values, check_width
 
@@ -58,15 +59,18 @@ class Quadratic:
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         parts = self._parts
         check_width(states, len(parts[0][0]))
-        if isinstance(states, np.ndarray):
-            return _values(states, *parts)
-        return [_values(x, *(part[s] for part in parts)) for s, x in enumerate(states)]
+        each = [
+            _values(writable(x), *(writable(part[s]) for part in parts))
+            for s, x in enumerate(states)
+        ]
+        return np.stack(each) if isinstance(states, np.ndarray) else each
 
 
-@per_lane("(f8[:,:], f8[:,:], f8[:,:], f8[:], f8[:,:])", "(n,d),(d,d),(d,a),(a)->(n,a)")
-def _values(states, pure, cross, alone, values):
-    """xᵀ P x + x·C + c at states x (…, n, d)."""
+@kept(nogil=True)
+def _values(states, pure, cross, alone):
+    """xᵀ P x + x·C + c of one seed at states x (n, d), (n, A)."""
     n, d = states.shape
+    values = np.empty((n, len(alone)))
     for i in range(n):
         square = 0.0
         for j in range(d):
@@ -77,3 +81,4 @@ def _values(states, pure, cross, alone, values):
             for j in range(d):
                 value += states[i, j] * cross[j, a]
             values[i, a] = value
+    return values

@@ -7,13 +7,14 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch
+from numba import njit
 from threadpoolctl import threadpool_limits
 from torch.nn import functional
 
 from bcrl.common.seeding import stream
 from bcrl.learning.dqn_update import batched, one_by_one
 from bcrl.learning.replay import Replay
-from bcrl.q.networks import cpu
+from bcrl.q.networks import cpu, tiles
 from bcrl.q.networks.mlp import Adam, DeepQ, Networks, xavier
 
 D, A, BATCH = 4, 8, 32
@@ -240,21 +241,33 @@ def test_a_gradient_that_is_no_number_is_seen_in_the_weights(way):
     assert deep.online.flat[1].isnan().any()
 
 
+@njit
+def adam(to, gradient):
+    """A step of Adam on arrays (1, n): the gradient is a product of one term."""
+    one, only = np.ones(1, np.float32), np.zeros(1, np.int64)
+    n = to[0].shape[1]
+    tiles.product_adam(to, n, only, 1, only, 1, one, 0, 0, gradient)
+
+
 def test_faded_moments_become_zero_and_not_denormal():
     smallest, n = np.finfo(np.float32).tiny, 50
     rng = np.random.default_rng(0)
-    parameters = rng.standard_normal(n).astype(np.float32)
-    first, second = np.zeros((2, n), np.float32)
+    parameters = rng.standard_normal((1, n)).astype(np.float32)
+    first, second = np.zeros((2, 1, n), np.float32)
     optimiser = Adam.of(torch.zeros(1, n), 1e-4)
-    exact = [parameters.astype(float), np.zeros(n), np.zeros(n)]
-    gradient = np.float32(10.0 ** rng.uniform(-14, 0, n))
+    exact = [parameters.astype(float), np.zeros((1, n)), np.zeros((1, n))]
+    gradient = np.zeros((1, 64), np.float32)  # tiles read beyond n
+    gradient[:, :n] = 10.0 ** rng.uniform(-14, 0, n)
+    nothing = np.zeros_like(gradient)
     for step in range(1, 3001):
-        now = gradient if step <= 3 else np.zeros_like(gradient)
-        cpu._adam_step(parameters, first, second, now, optimiser.next_step())
+        now = gradient if step <= 3 else nothing
+        beta1, beta2, *others = optimiser.next_step()
+        constants = (beta1, 1 - beta1, beta2, 1 - beta2, *others)
+        adam((parameters, first, second, *constants), now)
         for moment in (first, second):
             assert not ((moment != 0) & (np.abs(moment) < smallest)).any()
-        exact[1] = 0.9 * exact[1] + 0.1 * now
-        exact[2] = 0.999 * exact[2] + 0.001 * now.astype(float) ** 2
+        exact[1] = 0.9 * exact[1] + 0.1 * now[:, :n]
+        exact[2] = 0.999 * exact[2] + 0.001 * now[:, :n].astype(float) ** 2
         scaled = exact[1] / (1.0 - 0.9**step)
         spread = np.sqrt(exact[2] / (1.0 - 0.999**step))
         exact[0] = exact[0] - 1e-4 * scaled / (spread + 1e-8)
