@@ -64,7 +64,10 @@ class Replay:
         parts = (state, next_state, next_base, *scalars)
         row = np.concatenate(parts, -1, dtype=np.float32, casting="same_kind")
         index = self.added % self.capacity
-        self.rows[:, index] = torch.from_numpy(row)
+        if self.rows.is_cpu:  # NumPy's assignment costs a tenth of torch's
+            self.rows.numpy()[:, index] = row
+        else:
+            self.rows[:, index] = torch.from_numpy(row)
         self.valid[:, index] = False
         self.added += 1
 

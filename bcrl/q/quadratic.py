@@ -54,31 +54,34 @@ class Quadratic:
         d = self.matrix.shape[-1] - act.shape[1]
         cross = 2.0 * self.matrix[:, :d, d:] @ act.T + self.linear[:, :d, None]
         alone = (act @ self.matrix[:, d:, d:] * act).sum(-1)
-        return self.matrix[:, :d, :d], cross, alone + self.linear[:, d:] @ act.T
+        pure, alone = self.matrix[:, :d, :d], alone + self.linear[:, d:] @ act.T
+        return writable(pure), writable(cross), writable(alone)
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         parts = self._parts
         check_width(states, len(parts[0][0]))
-        each = [
-            _values(writable(x), *(writable(part[s]) for part in parts))
+        if isinstance(states, np.ndarray):
+            return _values(writable(states), *parts)
+        return [
+            _values(writable(x)[None], *(part[s : s + 1] for part in parts))[0]
             for s, x in enumerate(states)
         ]
-        return np.stack(each) if isinstance(states, np.ndarray) else each
 
 
 @kept(nogil=True)
 def _values(states, pure, cross, alone):
-    """xᵀ P x + x·C + c of one seed at states x (n, d), (n, A)."""
-    n, d = states.shape
-    values = np.empty((n, len(alone)))
-    for i in range(n):
-        square = 0.0
-        for j in range(d):
-            for k in range(d):
-                square += states[i, j] * pure[j, k] * states[i, k]
-        for a in range(len(alone)):
-            value = alone[a] + square
+    """xᵀ P x + x·C + c of each seed at states x (S, n, d), (S, n, A)."""
+    n_seeds, n, d = states.shape
+    values = np.empty((n_seeds, n, alone.shape[1]))
+    for s in range(n_seeds):
+        for i in range(n):
+            x, square = states[s, i], 0.0
             for j in range(d):
-                value += states[i, j] * cross[j, a]
-            values[i, a] = value
+                for k in range(d):
+                    square += x[j] * pure[s, j, k] * x[k]
+            for a in range(alone.shape[1]):
+                value = alone[s, a] + square
+                for j in range(d):
+                    value += x[j] * cross[s, j, a]
+                values[s, i, a] = value
     return values
