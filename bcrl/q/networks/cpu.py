@@ -203,10 +203,10 @@ def renew(target, sizes, rows, bootstrap, valid, indices, layout, stale, room):
 
 @_entry_point
 def renew_ahead(target, sizes, replay, held, indices, layout):
-    """`renew` for S seeds, at all `places` (T, S, B) of batches to come.
+    """`renew` for S seeds, at all `indices` (T, S, B) of batches to come.
 
-    In large products, and with a target's parameters loaded once. What is not among the
-    first `held` rows yet is left out.
+    In large products, and with a target's parameters loaded once. Rows that are not among the
+    first `held` ones yet are left out.
     """
     rows, bootstrap, valid = replay
     room, stale = space(sizes, _AHEAD), np.empty(_AHEAD, np.int64)

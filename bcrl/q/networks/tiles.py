@@ -247,7 +247,7 @@ def _tile(finish: Callable, *size: int) -> Callable:
 
 
 def _product(finish: Callable) -> Callable:
-    """A compiled product with a finish of its own."""
+    """A compiled product with the given finish."""
     wide, narrow = _tile(finish, VECTORS, LANES), _tile(finish, 1, NARROW)
 
     @njit
