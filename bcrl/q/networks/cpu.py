@@ -205,7 +205,7 @@ def renew(target, sizes, rows, bootstrap, valid, indices, layout, stale, room):
 def renew_ahead(target, sizes, replay, held, indices, layout):
     """`renew` for S seeds, at all `indices` (T, S, B) of batches to come.
 
-    In large products, and with a target's parameters loaded once. Rows that are not among the
+    This needs fewer and larger passes than batch by batch. Rows that are not among the
     first `held` ones yet are left out.
     """
     rows, bootstrap, valid = replay
