@@ -16,7 +16,7 @@ from bcrl.learning.bellman import residual_target, shaping
 from bcrl.learning.dataset import Dataset
 from bcrl.learning.stage import SeedBatch, Snapshot, Stage
 from bcrl.learning.transfer import StageInit, StageResult
-from bcrl.q.functions import NOT_FINITE, ZERO, Q, Table, Values, ask
+from bcrl.q.functions import NOT_FINITE, ZERO, Q, Table, Values, query
 from bcrl.q.regressors.base import Cell, Fitted, FittedQ, Problem, Regressor, fit_each
 
 
@@ -73,7 +73,7 @@ class FQI:
 
         def at_points(q: Q) -> list[Floats]:  # S arrays (P, A)
             nonlocal failed
-            values, lost = ask(q, [d.points for d in data], n_actions)
+            values, lost = query(q, [d.points for d in data], n_actions)
             failed = lost | failed
             return values
 

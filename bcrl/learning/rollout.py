@@ -15,7 +15,7 @@ from bcrl.envs import Env, Success, is_finite, is_simulated, lanes_of
 from bcrl.envs.base import FiniteEnv
 from bcrl.learning import Booleans, Floats, Integers
 from bcrl.learning.policies import greedy, uniform, walk
-from bcrl.q.functions import NOT_FINITE, Q, Table, ask, rows_of
+from bcrl.q.functions import NOT_FINITE, Q, Table, query, rows_of
 
 AT_ONCE = 128  # simulators that exist at a time in `play`,
 EPISODES = 32  # at most this many of them for one seed
@@ -116,7 +116,7 @@ def rollout(
         exploit = alive & (u[..., 0] >= epsilon)
         if exploit.any():  # Q may be expensive: query it only where it decides
             queried = [x[lanes] for x, lanes in zip(states, exploit, strict=True)]
-            values, lost = ask(q, queried, env.n_actions)
+            values, lost = query(q, queried, env.n_actions)
             failed.update(lost | failed)
             action[exploit] = greedy(np.concatenate(values), u[..., 1][exploit])
         return action

@@ -55,7 +55,7 @@ def rows_of(env: FiniteEnv, state: NDArray[np.float64]) -> NDArray[np.intp]:
     return row
 
 
-def ask(
+def query(
     q: Q, states: Sequence[NDArray[np.float64]], n_actions: int
 ) -> tuple[list[NDArray[np.float64]], dict[int, str]]:
     """Values (n_s, A) of S seeds, and why seeds failed, by their index in `states`.

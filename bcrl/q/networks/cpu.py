@@ -131,7 +131,7 @@ def row_times(row, weights, out):
 
 
 @_compiled
-def ask(flat, sizes, state, row, out):
+def _outputs_at_one(flat, sizes, state, row, out):
     """Outputs of one seed's network at one state (d,), in `out`; `row` is overwritten.
 
     Both as long as the widest layer and one. Too little for tiles.
@@ -160,7 +160,7 @@ def outputs(flat, sizes, x):
     values = np.empty_like(row)
     for s in range(n_seeds):
         if n == 1:
-            ask(flat[s], sizes, x[s, 0], row, values)
+            _outputs_at_one(flat[s], sizes, x[s, 0], row, values)
             out[s, 0] = values[:n_out]
             continue
         for b in range(n):
@@ -257,5 +257,5 @@ def update(networks, sizes, replay, indices, layout, adam, states, loss, next_va
             total_loss += clipped * (error - np.float32(0.5) * clipped)
         loss[s] = total_loss / n
         backward(online[s], moments[0, s], moments[1, s], sizes, room, n, constants)
-        ask(online[s], sizes, states[s], row, answer)
+        _outputs_at_one(online[s], sizes, states[s], row, answer)
         next_values[s] = answer[:n_actions]
