@@ -16,7 +16,7 @@ from bcrl.learning.rollout import draws, rollout, start_states
 from bcrl.learning.stage import CurriculumRun, Snapshot, Stage, learn
 from bcrl.learning.transfer import Boost, warm_start
 from bcrl.q.forest.estimator import ExtraTrees
-from bcrl.q.functions import Table, ask
+from bcrl.q.functions import Table, query
 from bcrl.q.regressors.base import Fit, Fitted, FittedQ, Problem
 from bcrl.q.regressors.ours import ForestRegressor, Tabular
 from bcrl.q.regressors.scikit import Sklearn
@@ -147,7 +147,7 @@ def test_seeds_that_fail_are_left_out_when_q_is_evaluated():
                 raise LostSeeds({seed: f"seed {seed}"})
         return [np.ones((len(x), n_actions)) for x in states]
 
-    values, failed = ask(q, np.zeros((4, 5, 1)), 2)
+    values, failed = query(q, np.zeros((4, 5, 1)), 2)
     assert failed == {0: "seed 0", 2: "seed 2"}
     assert [v.mean() for v in values] == [0, 1, 0, 1] and values[0].shape == (5, 2)
 
@@ -155,7 +155,7 @@ def test_seeds_that_fail_are_left_out_when_q_is_evaluated():
         raise LostSeeds({0: "again"})
 
     with pytest.raises(LostSeeds, match="again"):
-        ask(always, np.zeros((1, 1, 1)), 2)
+        query(always, np.zeros((1, 1, 1)), 2)
 
 
 def test_a_model_that_predicts_too_little_is_named():
