@@ -65,8 +65,8 @@ def for_hydra(asked: Namespace) -> list[str]:
     for action in flag_parser()._actions:
         value = getattr(asked, action.dest, None)
         if value and action.dest not in _OURS:
-            longest = max(action.option_strings, key=len)
-            given.append(longest if value is True else f"{longest}={value}")
+            short, long = (f(action.option_strings, key=len) for f in (min, max))
+            given.append(short if value is True else f"{long}={value}")
     return given
 
 
