@@ -334,6 +334,6 @@ def test_the_users_folder_is_found_and_named_in_what_is_recorded(
     assert p.root == Path("elsewhere")
     asked = flags.arguments()
     assert asked.config_dir == str(tmp_path / "bcrl") and asked.unnamed
-    assert flags.for_hydra(asked) == ["--multirun"]
+    assert flags.for_hydra(asked) == ["-m"]
     monkeypatch.setattr(sys, "argv", ["bcrl", "env=maze", "--config-dir=other"])
     assert flags.arguments().config_dir == os.path.abspath("other")
