@@ -6,6 +6,9 @@ READY := $(VENV)/.ready
 SCALE ?= quick
 WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 
+# Without bytecode each process would compile all of torch again.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help setup figures paper searches smoke report verify test test-all lint docs bench \
 	bench-peer clean

@@ -156,13 +156,11 @@ def _rows(
     snapshot: Snapshot, probe: fqi_metrics.Probe | StepProbe, seeds: Sequence[int]
 ) -> list[dict]:
     """A snapshot's rows; BcrlError if a seed failed."""
-    measured, count = probe.measure(snapshot), snapshot.count
+    measured = probe.measure(snapshot)
     if probe.failed:
         lost = ", ".join(f"seed {seeds[s]}: {why}" for s, why in probe.failed.items())
-        raise BcrlError(f"at {probe.index} {count}: {lost}")
-    where = {"stage": snapshot.stage.number, "task": snapshot.stage.task}
-    where[probe.index] = count
-    pairs = zip(seeds, measured, strict=True)
+        raise BcrlError(f"at {probe.index} {snapshot.count}: {lost}")
+    where, pairs = probe.place(snapshot), zip(seeds, measured, strict=True)
     return [{"seed": seed} | where | metrics for seed, metrics in pairs]
 
 

@@ -23,7 +23,8 @@ from bcrl.errors import ConfigError
 VARIABLE = "BCRL_TRUST"  # of this process and the workers that it starts
 #: The keys whose values may name code.
 NAMING = (
-    *("env.name", "env.id", "env.observation", "env.wrappers", "algorithm.name"),
+    *("env.name", "env.id", "env.observation", "env.tasks.observation"),
+    *("env.wrappers", "env.tasks.wrappers", "algorithm.name"),
     *("algorithm.regressor.name", "curriculum.name", "transfer.name", "logger.name"),
 )
 
@@ -32,12 +33,20 @@ def named_code(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """The keys of a config that name code of the user's, each with the name."""
     values = flat(dict(config))
     for key in NAMING:
-        value = values.get(key)
-        for one in value if isinstance(value, list) else [value]:
+        for one in _single(values.get(key)):
             name = one.get("name") if isinstance(one, dict) else one
             end = ":" if key == "env.id" else "."
             if isinstance(name, str) and (end in name or is_trusted(name)):
                 yield key, name
+
+
+def _single(value: Any) -> Iterator[Any]:
+    """The values in a list of lists; a value that is no list is itself the only one."""
+    if isinstance(value, list):
+        for one in value:
+            yield from _single(one)
+    else:
+        yield value
 
 
 def trust(name: str) -> None:

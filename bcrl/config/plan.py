@@ -21,7 +21,7 @@ from bcrl.config.variant import Composition, composition
 from bcrl.envs import Env, check_tasks
 from bcrl.envs.tasks import tasks_of
 from bcrl.errors import ConfigError, at_least, did_you_mean
-from bcrl.evaluation import metrics as probes
+from bcrl.evaluation.metrics import check_metrics
 from bcrl.learning.stage import Stage
 from bcrl.learning.transfer import PolicyReuse, ResidualPolicy, Shape
 from bcrl.results.loggers import logger
@@ -217,5 +217,5 @@ def _tasks(section: Plain) -> tuple[list[Env], tuple[str, ...]]:
     metrics = section.get("metrics")
     if not isinstance(metrics, list) or not metrics:
         raise ConfigError("env.metrics", metrics, "must be a list of metric names")
-    probes.check_metrics(metrics, tasks[-1])
+    check_metrics(metrics, tasks[-1])
     return tasks, tuple(metrics)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.learning.rollout import Episodes
+from bcrl.learning.stage import Snapshot
 
 
 class SeedProbe(ABC):
@@ -27,6 +28,12 @@ class SeedProbe(ABC):
     @abstractmethod
     def measure(self, snapshot: Any) -> list[dict[str, float]]:
         """Each seed's metrics, by column of the CSV."""
+
+    def place(self, snapshot: Snapshot) -> dict[str, int]:
+        """The first columns of a snapshot's rows: stage, task and count."""
+        stage = snapshot.stage
+        count = {self.index: snapshot.count}
+        return {"stage": stage.number, "task": stage.task} | count
 
     @abstractmethod
     def final(self, s: int) -> dict[str, NDArray]:

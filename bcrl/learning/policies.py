@@ -74,8 +74,7 @@ def walk(next_row, reward, absorbing, q, first, u, epsilon):
     """One seed's ε-greedy episodes in a finite task, row by row from `first` (E,).
 
     next_row, reward, absorbing, q: tables (N, A); u: uniforms (T, E, 2 or more).
-    Returns rows (E, T + 1), actions (E, T) and lengths (E,). It stands beside `_best`
-    because numba's cache of one file does not see changes of another.
+    Returns rows (E, T + 1), actions (E, T) and lengths (E,).
     """
     horizon, episodes = u.shape[0], u.shape[1]
     n_actions = q.shape[1]

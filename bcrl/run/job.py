@@ -166,8 +166,8 @@ class _Training:
 
     def measure(self, snapshot: Snapshot) -> None:
         """Append a row per seed; the last row of a seed may show its failure."""
-        stage, index, progress = snapshot.stage, self.probe.index, self.progress
-        where = {"stage": stage.number, "task": stage.task, index: snapshot.count}
+        index, progress = self.probe.index, self.progress
+        where = self.probe.place(snapshot)
         new = [
             [] if place in progress.failed else [where | metrics]
             for place, metrics in enumerate(self.probe.measure(snapshot))

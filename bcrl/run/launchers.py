@@ -24,7 +24,7 @@ from hydra_plugins.hydra_submitit_launcher.submitit_launcher import SlurmLaunche
 
 from bcrl.common.signals import EXIT_CODE, Interrupted, Stop
 from bcrl.common.terminal import say
-from bcrl.config import jobs as planning
+from bcrl.config.jobs import plan_of_job
 from bcrl.config.plan import part
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.run import records
@@ -103,7 +103,7 @@ class Slurm(SlurmLauncher):
         size, divided = self.seeds_per_job, []
         for overrides in map(list, jobs):
             config = load(self.config, overrides)
-            plan = planning.plan_of_job(config, config.hydra)
+            plan = plan_of_job(config, config.hydra)
             parts: list[str | None] = [None]
             if size and config.seeds.part is None:
                 number = -(-len(plan.seeds) // size)

@@ -336,6 +336,15 @@ def test_a_folder_that_is_named_may_name_code_and_a_config_alone_may_not(
     assert jobs.plans(flags.arguments())
 
 
+def test_tasks_name_code_as_the_environment_does():
+    tasks = {"observation": ["zoo.a", None], "wrappers": [[{"name": "zoo.W"}], []]}
+    found = list(plugins.named_code({"env": {"name": "gymnasium", "tasks": tasks}}))
+    assert found == [
+        ("env.tasks.observation", "zoo.a"),
+        ("env.tasks.wrappers", "zoo.W"),
+    ]
+
+
 def test_the_sources_of_code_that_was_named_are_known(folder, tmp_path):
     before = plan(MAZE, *NAMES_MEAN).sources
     (tmp_path / "code/zoo/broken.py").write_text("import another")

@@ -208,7 +208,7 @@ def test_each_seed_is_computed_once_by_racing_processes(tmp_path, processes):
 
 
 LONG = ("env=maze", "curriculum=on", "boosting=on", "tag=x", "seeds.count=2")
-LONG += ("seeds.lockstep=1", "algorithm.iterations=10", "threads=1")
+LONG += ("seeds.lockstep=1", "algorithm.iterations=40", "threads=1")
 
 
 def start(folder: Path, *more: str) -> subprocess.Popen:

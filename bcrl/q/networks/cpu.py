@@ -4,8 +4,8 @@ Computes what `mlp` and `DQN`'s torch update compute with batched products, but
 one seed's parameters stay in the cache from the batch to Adam, no cost is paid by the
 call, and units that are off for a whole batch are left out of the products
 (`tiles`). A seed's floats don't depend on the others. A transition's bootstrap
-value is kept until the target network changes, so that a batch asks the target only
-about transitions not drawn since.
+value is cached until the target network changes, so that a batch evaluates the target
+only at transitions that no batch has drawn since.
 
 A layer's parameters, weights (in, out) and then biases, are one matrix (in + 1, out):
 the input of a layer has a row of ones. `outputs`, `renew_ahead` and
@@ -72,7 +72,7 @@ def forward(flat, sizes, room, n):
         before, after = room.units[layer], room.units[layer + 1]
         before[n_in] = np.float32(1.0)
         alive, dead, m = room.alive[layer], room.dead[layer], 0
-        for k in range(n_in):  # it stays in one of the lists, the next takes the other
+        for k in range(n_in):  # written to both lists; the next unit overwrites one
             alive[m] = dead[k - m] = k
             m += room.some[k] != 0
         alive[m] = n_in
@@ -175,10 +175,10 @@ def outputs(flat, sizes, x):
 
 @_compiled
 def renew(target, sizes, rows, bootstrap, valid, indices, layout, stale, room):
-    """Make one seed's `bootstrap` max_a' (ϱ + base)(s') valid at `places`.
+    """Make one seed's `bootstrap` max_a' (ϱ + base)(s') valid at `indices`.
 
     rows, bootstrap, valid: the seed's part of `Replay`'s; stale (n,) and room for as
-    many inputs are overwritten: up to n rows at a time are asked for.
+    many inputs are overwritten: the target is evaluated at up to n rows at a time.
     """
     d, n_actions = layout
     n, last = 0, len(indices) - 1
