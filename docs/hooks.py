@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from mkdocs.structure.files import File
 
-from bcrl.config.describe import GROUPS, SHORTHANDS, entries, options
+from bcrl.config.describe import GROUPS, SHORTHANDS, entries, option_comments
 
 TOP = """# Config keys
 
@@ -28,7 +28,7 @@ def config_page() -> str:
     for group in ("", *GROUPS, *SHORTHANDS):
         text += f"\n## {f'Group `{group}`' if group else 'Keys of no group'}\n"
         if group:
-            found = ((f"`{option}`", x) for option, x in options(group).items())
+            found = ((f"`{option}`", x) for option, x in option_comments(group).items())
             text += table(["option", "meaning"], found)
         of = [entry for entry in known if entry.group == group]
         rows = [(f"`{e.key}`", e.default, *e.parts[1:], e.parts[0]) for e in of]
