@@ -10,12 +10,12 @@ import pandas as pd
 import pytest
 
 from bcrl.errors import BcrlError
-from bcrl.report import cli, late
+from bcrl.report import cli
 from bcrl.report.claims.document import claims_report
 from bcrl.report.figures import style
-from bcrl.report.figures.linear import figure_4a, figure_4b, prior
+from bcrl.report.figures.linear import figure_4a, figure_4b, pretraining, prior
 from bcrl.report.load import load_runs
-from bcrl.report.sweeps import groups, sweep_report
+from bcrl.report.sweeps import sweep_sections, sweep_table
 from bcrl.report.tables import aggregate, number
 from bcrl.report.variants import COMPARED
 from bcrl.results.layout import DQN_METRICS, FQI_METRICS, INDEX, seed_path
@@ -175,8 +175,8 @@ def test_failed_seeds_are_left_out_by_name(tmp_path):
         (lambda t: t[:30], "in its length (30 rows, not 41)"),
         (lambda t: t.assign(greedy_return=np.inf), "greedy_return in row"),
         (lambda t: t.assign(step=t["step"][::-1].to_numpy()), "fall"),
-        (lambda t: t.assign(step=t["step"] + 0.5), "whole numbers"),
-        (lambda t: t.assign(step=t["step"] - 1000), "whole numbers"),
+        (lambda t: t.assign(step=t["step"] + 0.5), "whole number"),
+        (lambda t: t.assign(step=t["step"] - 1000), "whole number"),
         (
             lambda t: t.assign(step=range(1, 42)).rename(columns={"step": "iteration"}),
             "has the header stage,task,iteration",
@@ -238,7 +238,7 @@ def test_pretraining_is_of_the_variant_with_most_seeds(tmp_path):
     write(tmp_path, ("BC-DQN", "C-DQN"), range(2))
     write(tmp_path, ("RPL",), range(4))
     methods = load_runs(tmp_path, "smoke").compared("linear_system", None, "DQN")
-    found = late.pretraining(methods)
+    found = pretraining(methods)
     assert {k: v.method for k, v in found.items()} == {"lspi": "RPL", "dqn": "C-DQN"}
 
 
@@ -326,11 +326,10 @@ def test_late_returns_recomputed(tmp_path):
     methods = load_runs(tmp_path, "smoke").methods("linear_system", None, "DQN")
     for name, variant in methods.items():
         table = pd.read_csv(csv(tmp_path, name, 4))
-        assert len(late.late_rows(variant)) == 5
         expected = table["return"][-5:].mean()
-        assert late.late(variant, "return")[4] == pytest.approx(expected)
+        assert variant.late("return")[4] == pytest.approx(expected)
         target = table["return"][table["task"] == 2]
-        assert late.area(variant, "return")[4] == pytest.approx(target.mean())
+        assert variant.area("return")[4] == pytest.approx(target.mean())
 
 
 # --- searches
@@ -346,16 +345,18 @@ def test_variants_of_a_method_are_compared(tmp_path):
         write(tmp_path, ("BC-DQN",), range(1000, 1005), tag, **made)
     write(tmp_path, ("DQN",), range(1))
     runs = load_runs(tmp_path, "smoke")
-    (group,) = groups(runs)
-    assert (group.method, group.keys) == ("BC-DQN", ("algorithm.target_update",))
-    assert group.best.name == "BC-DQN@f200"
-    text = sweep_report(runs, [group])
+    table = sweep_table(runs)
+    assert set(table["method"]) == {"BC-DQN"}
+    best = table[table["best"]]
+    assert best[["variant", "settings"]].to_numpy().tolist() == [
+        ["BC-DQN@f200", '{"algorithm.target_update": "2000"}']
+    ]
+    text = "".join(map(str, sweep_sections(table)))
     assert "3 variants. Seeds 1000–1004." in text
     assert "Best: BC-DQN@f200 (algorithm.target_update = 2000)." in text
     (bold,) = (line for line in text.splitlines() if "**−" in line)
     assert bold.startswith("| BC-DQN@f200 | 2000 | 1000–1004 · 5 | **−")
-    mean = late.late(group.best, "return").mean()
-    assert f"**{number(mean)} [" in bold
+    assert f"**{number(best['late_return'].item())} [" in bold
 
 
 def test_variants_of_fqi_and_failed_seeds(tmp_path):
@@ -376,4 +377,3 @@ def test_variants_of_fqi_and_failed_seeds(tmp_path):
     assert table["late_return"].isna().all() and table["best"].tolist() == [False, True]
     returns = "– | **−3.000 [−3.000, −3.000]** | – |"
     assert f"| FQI@trees100 | 100 | 0–1 · 2 (1 failed) | {returns}" in text
-    assert 'seed_0002.json says "failed: non-finite weights at step 3"' in text

@@ -171,11 +171,11 @@ def test_a_csv_that_is_none_is_named(folder, verified):
 
 def test_a_config_that_is_not_the_seeds_is_named_with_the_difference(folder, verified):
     for changes, what in (
-        ({"episodes": 6}, "algorithm.episodes: there 6, here 5)"),
+        ({"episodes": 6}, "algorithm.episodes: there 5, here 6)"),
         ({"episodes": 5.0}, "(types of values)"),
         (
             {"a": 1, "b": 2, "c": 3, "episodes": 5, "name": "other"},
-            "algorithm.c: there 3, here 'absent'; and 1 more)",
+            "algorithm.c: there 'absent', here 3; and 1 more)",
         ),
     ):
         edit_config(folder / "config.yaml", "algorithm", **changes)
