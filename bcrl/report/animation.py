@@ -13,7 +13,6 @@ from bcrl.envs.rendering import draw, frames_per_second
 from bcrl.envs.tasks import tasks_of
 from bcrl.errors import BcrlError, did_you_mean
 from bcrl.report.variants import Runs, Variant
-from bcrl.results.read import Finding
 
 _COLOURS = 64  # of a GIF's palette
 _PAUSE = 1500  # ms that the last frame stands
@@ -79,10 +78,6 @@ def frames(variant: Variant, seed: int) -> tuple[list[np.ndarray], int]:
     """The T + 1 pictures of a seed's recorded episode, and how long one stands, ms."""
     states, actions = variant.arrays(seed, "trajectory", "trajectory_actions")
     env = tasks_of(variant.sidecars[variant.seeds.index(seed)]["config"]["env"])[-1]
-    if states.shape != (len(actions) + 1, env.state_dim):
-        what = f"has a trajectory of shape {states.shape}, expected (T + 1, "
-        what += f"{env.state_dim}) for actions of shape {actions.shape}"
-        raise Finding(variant.npz(seed), what)
     if is_simulated(env):
         (start,) = variant.arrays(seed, "trajectory_start")
         pictures = env.pictures(start, actions)

@@ -16,8 +16,8 @@ from bcrl.report.claims.document import claims_report
 from bcrl.report.figures import curves, linear, maze, style
 from bcrl.report.load import load_runs
 from bcrl.report.page import page
-from bcrl.report.sweeps import SWEEPS_PREAMBLE, sweep_sections, sweep_table
-from bcrl.report.tables import aggregate
+from bcrl.report.sweeps import sweep_sections, sweep_table
+from bcrl.report.tables import TEXTS, aggregate
 from bcrl.report.variants import COMPARED, LINEAR, Runs, env_title
 from bcrl.results.arguments import ResultsParser
 
@@ -80,11 +80,9 @@ def report(
             drawn.setdefault(pair, []).append((image, caption))
             continue
         lacking = f"{pair[0]}/{needed or '*'}{f'@{tag}' if tag else ''}"
-        remedy = f"`bcrl experiment={experiment} scale={runs.scale}` makes them"
-        if tag:
-            example = f"`bcrl experiment={experiment}_released scale={runs.scale}`"
-            remedy = f"runs with tag={tag} make them, as {example} does"
-        skipped.append(f"figure {name}: no runs of {lacking}: {remedy}")
+        which = {None: "", "released": "_released"}.get(tag, f" tag={tag}")
+        command = f"`bcrl experiment={experiment}{which} scale={runs.scale}`"
+        skipped.append(f"figure {name}: no runs of {lacking}: {command} makes them")
     others = [p for p in runs.pairs if p not in COMPARED] if CURVES in figures else []
     for env, family in others:
         # Where there are tagged variants only, one figure per tag.
@@ -97,14 +95,14 @@ def report(
             picture = image, "Mean over seeds with 95 % intervals."
             fallback.setdefault((env, family), []).append(picture)
     texts: dict[str, str | pd.DataFrame] = {}
-    for family, stem in (("FQI", "aggregate"), ("DQN", "aggregate_dqn")):
-        if family in {family for _, family in runs.pairs}:
-            texts[f"{stem}_{runs.scale}.csv"] = aggregate(runs, family)
+    for family in sorted({family for _, family in runs.pairs}, reverse=True):
+        stem = {"FQI": "aggregate", "DQN": "aggregate_dqn"}[family]
+        texts[f"{stem}_{runs.scale}.csv"] = aggregate(runs, family)
     texts[f"claims_{suffix}.md"] = claims_report(runs, tag)
     compared = sweep_table(runs)
     if sweeps := sweep_sections(compared):
         title = f"# Variants compared, scale {runs.scale}\n"
-        parts = [title, SWEEPS_PREAMBLE, *map(str, sweeps)]
+        parts = [title, TEXTS["sweeps"], *map(str, sweeps)]
         texts[f"sweep_{runs.scale}.md"] = "\n".join(parts)
         texts[f"sweep_{runs.scale}.csv"] = compared
     agents = [

@@ -29,7 +29,12 @@ def load_runs(runs_dir: Path, scale: str, allow_incomplete: bool = False) -> Run
     loaded = [_variant(each, notes) for each in checked]
     runs = Runs(scale, tuple(filter(None, loaded)), notes)
     if not runs.variants:
-        raise BcrlError(_nothing(runs_dir, scale, notes))
+        others = {p.parts[-4] for p in runs_dir.glob("*/*/*/seed_*.json")} - {scale}
+        there = f"; there are runs at scale {listed(sorted(others))}" if others else ""
+        seen = f" ({notes[0].text})" if notes else ""
+        shown = f"`{shlex.join(['bcrl', 'experiment=fig1', f'scale={scale}'])}`"
+        what = f"no complete runs under {runs_dir / scale}{seen}{there}"
+        raise BcrlError(f"{what}; {shown} makes those of figure 1")
     for env, family in runs.pairs:
         expected = COMPARED.get((env, family))
         for tag in sorted({v.tag or "" for v in runs.of(env, family)}):
@@ -57,19 +62,6 @@ def _rejection(
     return "\n".join(lines)
 
 
-def _nothing(runs_dir: Path, scale: str, notes: list[Note]) -> str:
-    """The message if there is no complete run."""
-    others = sorted({p.parts[-4] for p in runs_dir.glob("*/*/*/seed_*.json")} - {scale})
-    there = f"; there are runs at scale {listed(others)}" if others else ""
-    seen = f" ({notes[0].text})" if notes else ""
-    shown = shlex.join(["bcrl", "experiment=fig1", f"scale={scale}"])
-    return (
-        f"no complete runs under {runs_dir / scale}{seen}{there}: `{shown}` makes "
-        "those of figure 1, experiment=fig2 those of figures 2, 3 and 5, "
-        "experiment=fig4 those of figure 4"
-    )
-
-
 def _variant(checked: Checked, notes: list[Note]) -> Variant | None:
     """A checked folder's seeds in arrays; None if it can't be drawn, with a note."""
     folder, documents, tables = checked.folder, checked.documents, checked.tables
@@ -92,15 +84,15 @@ def _variant(checked: Checked, notes: list[Note]) -> Variant | None:
         return None
     first, *_ = tables.values()
     family = family_of(first)
-    index = INDEX[family]
     needed = FQI_METRICS.get(folder.parent.name, ()) if family == "FQI" else ()
     if lacking := [name for name in needed if name not in first]:
         note(f"does not record {listed(lacking)}: left out")
         return None
     metrics = {
         str(name): np.stack([table[name].to_numpy() for table in tables.values()])
-        for name in first.columns.difference(index, sort=False)
+        for name in first
     }
+    rows = [metrics.pop(name)[0].astype(np.int64) for name in INDEX[family]]
     for values in metrics.values():
         values[~np.isfinite(values)] = np.nan  # a gap, not a line to infinity
     sidecars = tuple(documents[seed] for seed in tables)
@@ -110,5 +102,4 @@ def _variant(checked: Checked, notes: list[Note]) -> Variant | None:
     if far := diverging(metrics):
         which = ", ".join(f"{name} up to {value:.3g}" for name, value in far.items())
         note(f"diverges, {which}", f"{folder.name} diverges ({which})")
-    rows = (first[name].to_numpy().astype(np.int64) for name in index)
     return Variant(folder, family, tuple(tables), *rows, metrics, sidecars, failed)

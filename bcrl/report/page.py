@@ -10,12 +10,11 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from bcrl import __version__
-from bcrl.report.claims.document import GLOSSARY, PREAMBLE, claims_sections, notes_of
+from bcrl.report.claims.document import claims_sections, notes_of
 from bcrl.report.curve_data import curve_data
 from bcrl.report.notes import incomplete
 from bcrl.report.origins import configurations, costs, seed_origins
-from bcrl.report.sweeps import SWEEPS_PREAMBLE
-from bcrl.report.tables import Section, TextTable, duration
+from bcrl.report.tables import TEXTS, Section, TextTable, duration
 from bcrl.report.variants import Runs, env_title
 
 Pair = tuple[str, str]  # environment and family
@@ -33,38 +32,22 @@ def page(
     """The page of one scale's runs. `figures` are the paper's; `fallback` is for
     browsers that can't show the interactive curves; `agents` move."""
     notes, claims = notes_of(runs, tag), claims_sections(runs, tag)
-    sections = [
-        {
-            "id": f"runs-{number}",
-            "title": f"{env_title(pair[0])}, {pair[1]}",
-            "pictures": figures.get(pair, ()),
-            "fallback": fallback.get(pair, ()),
-            "claims": claims.get(pair, Section("", [])),
-        }
-        for number, pair in enumerate(runs.pairs)
-    ]
-    style, script = (
-        _TEMPLATES.loader.get_source(_TEMPLATES, f"page.{kind}")[0]
-        for kind in ("css", "js")
-    )
     return _TEMPLATES.get_template("page.html").render(
         version=__version__,
-        title=f"Boosted curriculum RL, scale {runs.scale}"
-        + (f" @{tag}" if tag else ""),
-        style=Markup(style),
-        script=Markup(script),
+        runs=runs,
+        tag=tag,
+        notes=notes,
         incomplete=incomplete(notes),
         facts=_facts(runs, claims),
-        sections=sections,
+        figures=figures,
+        fallback=fallback,
+        claims=claims,
         agents=agents,
         sweeps=sweeps,
-        sweeps_preamble=SWEEPS_PREAMBLE,
         costs=costs(runs),
         configs=configurations(runs),
         provenance=seed_origins(runs),
-        notes=[note.text for note in notes],
-        preamble=PREAMBLE,
-        glossary=GLOSSARY,
+        texts=TEXTS,
         curves=[curve_data(runs, env, family, tag) for env, family in runs.pairs],
     )
 
@@ -96,14 +79,9 @@ def _url(image: Path) -> str:
 
 def _prose(text: str) -> Markup:
     """Escaped text, with the emphasis and code that the Markdown documents use."""
-    html = str(escape(text))
-    for pattern, element in (
-        (r"\*\*(.+?)\*\*", "strong"),
-        (r"\*(\w[^*]*?)\*", "em"),
-        (r"`([^`]+)`", "code"),
-    ):
-        html = re.sub(pattern, rf"<{element}>\1</{element}>", html)
-    return Markup(html)
+    html = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", str(escape(text)))
+    html = re.sub(r"\*(\w[^*]*?)\*", r"<em>\1</em>", html)
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", html))
 
 
 def _sha256(text: str) -> str:
@@ -121,3 +99,4 @@ _TEMPLATES = Environment(  # escapes whatever is no `Markup`
 _STRICT = {"separators": (",", ":"), "allow_nan": False, "ensure_ascii": False}
 _TEMPLATES.policies["json.dumps_kwargs"] = _STRICT
 _TEMPLATES.filters |= {"prose": _prose, "url": _url, "sha256": _sha256}
+_TEMPLATES.filters["env_title"] = env_title

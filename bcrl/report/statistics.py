@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,13 +11,9 @@ _RESAMPLES = 10_000
 LEVEL = 0.95
 MOST_DRAWS = 4_000_000  # resampled seeds that are held in memory at a time
 _SEED = 20_220_425  # every interval draws from its own generator, started from this
-
-
-class Interval(NamedTuple):
-    """A closed interval; both ends are nan where the data allow none."""
-
-    low: float
-    high: float
+#: Below this a percentile bootstrap is far too narrow: no verdict is given.
+FEWEST_SEEDS = 5
+Interval = tuple[float, float]  # closed; both ends are nan where the data allow none
 
 
 def standard_error(values: np.ndarray, ddof: int = 0) -> np.ndarray:
@@ -38,7 +33,7 @@ def bootstrap(
     for non-finite values (Efron and Tibshirani 1993, chapter 13)."""
     given = [np.asarray(sample, float) for sample in samples]
     if not all(len(sample) > 1 and np.isfinite(sample).all() for sample in given):
-        return Interval(math.nan, math.nan)
+        return math.nan, math.nan
 
     def of(*drawn: np.ndarray, axis: int) -> np.ndarray:
         first, *rest = (statistic(each, axis=axis) for each in drawn)
@@ -54,7 +49,8 @@ def bootstrap(
         method="percentile",
         rng=np.random.default_rng(_SEED),
     )
-    return Interval(*map(float, found.confidence_interval))
+    low, high = found.confidence_interval
+    return float(low), float(high)
 
 
 def bootstrap_curves(
@@ -81,7 +77,7 @@ def share_interval(successes: int, n: int) -> Interval:
     """95 % Wilson score interval of a share. Used for shares of seeds, where the
     bootstrap of 0 of n has no width (Wilson 1927)."""
     found = stats.binomtest(successes, n).proportion_ci(LEVEL, method="wilson")
-    return Interval(float(found.low), float(found.high))
+    return float(found.low), float(found.high)
 
 
 def share_difference_interval(k1: int, n1: int, k2: int, n2: int) -> Interval:
@@ -89,4 +85,4 @@ def share_difference_interval(k1: int, n1: int, k2: int, n2: int) -> Interval:
     p1, p2 = k1 / n1, k2 / n2
     (l1, u1), (l2, u2) = share_interval(k1, n1), share_interval(k2, n2)
     low = p1 - p2 - math.hypot(p1 - l1, u2 - p2)
-    return Interval(low, p1 - p2 + math.hypot(u1 - p1, p2 - l2))
+    return low, p1 - p2 + math.hypot(u1 - p1, p2 - l2)

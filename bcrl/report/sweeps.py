@@ -8,21 +8,12 @@ import pandas as pd
 from bcrl.common.identity import OUTPUT_KEYS, flat
 from bcrl.report.statistics import bootstrap
 from bcrl.report.tables import ABSENT, Section, TextTable, estimate, seeds_cell
-from bcrl.report.variants import WINDOW, Runs, Variant
+from bcrl.report.variants import Runs, Variant
 from bcrl.results.layout import spelled
 
 #: The mean that ranks variants, by family.
 _DECISIVE = {"FQI": "last_return", "DQN": "late_return"}
 _IGNORED = (*OUTPUT_KEYS, "scale")  # top-level keys of a config that all may differ in
-
-SWEEPS_PREAMBLE = f"""\
-Variants of one method that differ in their configuration, compared over the seeds
-named in their rows. *Late*: a seed's mean over the evaluations of its last {WINDOW}
-environment steps; *last*: the last evaluation or iteration. Brackets are 95 %
-percentile bootstrap intervals over seeds; the best mean of a group is **bold**: late
-for the DQN family, last for FQI. Chance flatters the best of many: test it on other
-seeds.
-"""
 
 
 def sweep_table(runs: Runs) -> pd.DataFrame:
@@ -94,9 +85,8 @@ def sweep_sections(table: pd.DataFrame) -> list[Section]:
                 interval = row[f"{name}_low"], row[f"{name}_high"]
                 cells[name.replace("_", " ")] = estimate(row[name], interval)
             if row["best"]:
-                decisive = (
-                    f"{'last' if np.isnan(row['late_return']) else 'late'} return"
-                )
+                fqi = np.isnan(row["late_return"])
+                decisive = "last return" if fqi else "late return"
                 cells[decisive] = f"**{cells[decisive]}**"
                 chosen = ", ".join(f"{key} = {v}" for key, v in settings.items())
                 text += f" Best: {row['variant']}{f' ({chosen})' if chosen else ''}."

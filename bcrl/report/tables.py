@@ -1,17 +1,30 @@
 """Tables of text, cells with intervals, and the long-form aggregate over seeds."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+import yaml
 from scipy import stats
 
-from bcrl.report.statistics import Interval, bootstrap, standard_error
-from bcrl.report.variants import Runs
+from bcrl.report.statistics import (
+    FEWEST_SEEDS,
+    Interval,
+    bootstrap,
+    standard_error,
+)
+from bcrl.report.variants import WINDOW, Runs
 from bcrl.results.layout import INDEX
 
 ABSENT = "–"  # a cell without a value
+_TEXTS = Path(__file__).with_name("templates") / "texts.yaml"
+#: Paragraphs of the documents and the page, by name.
+TEXTS = {
+    name: text.format(fewest=FEWEST_SEEDS, window=WINDOW)
+    for name, text in yaml.safe_load(_TEXTS.read_text("utf-8")).items()
+}
 
 
 class TextTable(NamedTuple):

@@ -102,13 +102,9 @@ class Variant:
         """Every seed's mean over all evaluations in the target, (S,)."""
         return self.metrics[metric][:, self.target_rows].mean(axis=1)
 
-    def npz(self, seed: int) -> Path:
-        """Where a seed's arrays are."""
-        return seed_path(self.folder, seed, "npz")
-
     def arrays(self, seed: int, *names: str) -> list[np.ndarray]:
         """The named arrays of a seed's NPZ; BcrlError if it does not hold them."""
-        return read_arrays(self.npz(seed), *names)
+        return read_arrays(seed_path(self.folder, seed, "npz"), *names)
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,8 @@ from typing import NoReturn
 from bcrl import __version__
 from bcrl.errors import BcrlError, closest
 
-#: Words that people type → the flag that they mean.
-_HABITS = {"help": "--help", "version": "--version", "v": "--version"}
-_HABITS |= {"output": "--out", "out-dir": "--out", "results": "--runs-dir"}
+#: Words that people type → the flag that they mean, where none is like them.
+_HABITS = {"v": "--version", "out-dir": "--out", "results": "--runs-dir"}
 _SCALES = ("smoke", "quick", "paper", "search")
 
 

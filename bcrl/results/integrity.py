@@ -94,12 +94,9 @@ def check_folder(folder: Path) -> Checked:
             findings.append(finding)
     findings += [*_config_findings(folder, documents), *_index_findings(folder, tables)]
     for seed, document in documents.items():
-        what, remedy = f'says "{document["status"]}"', AGAIN
-        if (state := state_of(document)) == layout.RUNNING:
-            what += ": it is being computed, or its process was killed"
-        else:
-            remedy += " to try it again, or leave it out"
-        if state != layout.COMPLETE:
+        if state_of(document) != layout.COMPLETE:
+            what = f'says "{document["status"]}"'
+            remedy = f"wait if it is being computed, else {AGAIN}"
             path = seed_path(folder, seed, "json")
             findings.append(Finding(path, what, remedy, INCOMPLETE))
     asked = set().union(*map(requested, documents.values()))

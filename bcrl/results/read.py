@@ -45,11 +45,9 @@ def read_document(folder: Path, seed: int) -> Document:
     path = layout.seed_path(folder, seed, "json")
     try:
         document = json.loads(_bytes(path))
-        intact = isinstance(document, dict) and is_intact(document)
-    except (ValueError, RecursionError) as error:
-        raise Finding(path, "is not readable JSON") from error
-    if not isinstance(document, dict):
-        raise Finding(path, "is not a JSON object")
+        intact = is_intact(document)
+    except (ValueError, RecursionError, AttributeError) as error:
+        raise Finding(path, "is not a readable JSON object") from error
     if (schema := document.get("schema")) != layout.SCHEMA:
         what = f"has schema {schema!r}, this version reads {layout.SCHEMA}"
         raise Finding(path, what)
@@ -60,24 +58,7 @@ def read_document(folder: Path, seed: int) -> Document:
             what = f"belongs to {key} {document.get(key)!r}, not {value!r}"
             back = f"move it back, or delete {path.with_suffix('')}.* and {AGAIN}"
             raise Finding(path, what, back)
-    if not _has_the_schema(document):
-        raise Finding(path, f"lacks entries of schema {layout.SCHEMA}")
     return document
-
-
-def _has_the_schema(document: Document) -> bool:
-    """Whether the entries that are relied on are there."""
-    try:
-        layout.requested(document)
-        metrics = document["config"]["env"]["metrics"]
-        state, hashes = layout.state_of(document), document.get("sha256")
-        # A seed that is running or failed may not have files yet.
-        begun = state == layout.RUNNING or (state == layout.FAILED and hashes is None)
-        ended = state in (layout.COMPLETE, layout.FAILED)
-        hashed = begun or (ended and {"csv", "npz"} <= (hashes or {}).keys())
-        return isinstance(metrics, list) and hashed
-    except (KeyError, TypeError, AttributeError):
-        return False
 
 
 def _bytes(path: Path) -> bytes:
@@ -102,13 +83,9 @@ def read_csv(path: Path, document: Document) -> pd.DataFrame:
     """A complete seed's table, all columns numbers; Finding if it isn't one."""
     data = read_recorded(path, document)
     try:
-        table = pd.read_csv(io.BytesIO(data))
+        table = pd.read_csv(io.BytesIO(data), dtype=float)
     except ValueError as error:
-        raise Finding(path, "is not a readable CSV") from error
-    try:
-        table = table.astype(float)
-    except ValueError as error:
-        raise Finding(path, f"holds something not a number ({error})") from error
+        raise Finding(path, f"is not a readable CSV of numbers ({error})") from error
     family = layout.family_of(table)
     metrics, finite = layout.DQN_METRICS, {*layout.DQN_METRICS} - {*layout.MAY_BE_NAN}
     if family == "FQI":
@@ -164,5 +141,5 @@ def read_folder(folder: str | Path) -> pd.DataFrame:
     if not numbers:
         raise BcrlError(f"{folder}: there is no seed_*.csv")
     found = {n: pd.read_csv(layout.seed_path(Path(folder), n, "csv")) for n in numbers}
-    together = pd.concat(found, names=["seed", None])
+    together = pd.concat(found, names=["seed"])
     return together.reset_index("seed").reset_index(drop=True)

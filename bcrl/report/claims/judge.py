@@ -7,6 +7,7 @@ import yaml
 
 from bcrl.report.notes import listed
 from bcrl.report.statistics import (
+    FEWEST_SEEDS,
     Interval,
     bootstrap,
     share_difference_interval,
@@ -15,8 +16,6 @@ from bcrl.report.statistics import (
 from bcrl.report.tables import ABSENT, estimate
 from bcrl.report.variants import Methods, Variant
 
-#: Below this a percentile bootstrap is far too narrow: no verdict is given.
-FEWEST_SEEDS = 5
 _OPTIMAL = 1e-3  # a return this near V*(s0) is optimal: a detour costs 100 times more
 _NEAR = 0.01  # a mean return within this share of |V*(s0)| is nearly optimal
 
@@ -77,6 +76,7 @@ MEASURES = {
 _STATISTICS = {"deviation of return": np.std}  # of others the mean over seeds
 
 _DATA = yaml.safe_load(Path(__file__).with_name("claims.yaml").read_text("utf-8"))
+TITLES: dict[str, str] = _DATA["titles"]  # by environment
 #: Environment, family → statement → quantity, what is expected of it, and of whom.
 CLAIMS: dict[tuple[str, ...], dict[str, list[str]]] = {
     tuple(pair.split(", ")): found for pair, found in _DATA["claims"].items()

@@ -23,6 +23,7 @@ _SEEDS = {"linewidth": 0.5, "linestyle": (0, (3, 2)), "alpha": 0.45, "zorder": 1
 _TWO_ERRORS = "mean ± 2 standard errors over seeds"
 Band = tuple[np.ndarray, np.ndarray]
 Interval = Callable[[np.ndarray], Band]
+Rows = Callable[[Variant], np.ndarray]
 
 
 def label(family: str, metric: str) -> str:
@@ -54,7 +55,7 @@ def draw_metric(
     axes: Axes,
     methods: Methods,
     metric: str,
-    rows: Callable[[Variant], np.ndarray] | None = None,
+    rows: Rows | None = None,
     interval: Interval | None = two_errors,
 ) -> None:
     """Every method's mean over seeds with a band, or with all seeds if no `interval`.
@@ -95,47 +96,40 @@ def shared_spans(methods: Methods) -> list[style.Span]:
     return spans[0] if all(each == spans[0] for each in spans) else []
 
 
-def figure_curves(runs: Runs, env: str, family: str, tag: str | None = None) -> Figure:
-    """One panel per metric: mean and 95 % interval of every method, tasks shaded."""
-    methods = runs.tagged(env, family, tag)
-    metrics, spans = metrics_of(methods), shared_spans(methods)
-    columns = min(_COLUMNS, len(metrics))
-    rows = math.ceil(len(metrics) / columns)
-    size = max(0.6, columns / 2) * style.TEXT_WIDTH, 2.5 * rows + 0.7
-    figure = Figure(figsize=size)
-    panels = [*figure.subplots(rows, columns, squeeze=False).flat]
-    for axes in panels[len(metrics) :]:
-        axes.set_axis_off()
-    for axes, metric in zip(panels, metrics, strict=False):
-        if spans:
-            style.shade_tasks(axes, spans)
-        draw_metric(axes, methods, metric, spread_rows, bootstrap_curves)
-        axes.set(xlabel=COUNTED[family], ylabel=label(family, metric))
-        axes.margins(x=0.0)
-    style.legend(figure, methods)
-    what = "mean over seeds, bootstrapped 95 % interval"
-    style.footer(figure, runs, methods, what)
-    return figure
-
-
 def _panels(
     methods: Methods,
     labels: Mapping[str, str],
     size: tuple[float, float],
+    rows: Rows | None = None,
     interval: Interval | None = two_errors,
 ) -> tuple[Figure, list[Axes]]:
-    """Metrics side by side over the iterations, tasks shaded; labels by metric."""
-    figure = Figure(figsize=size)
-    panels = list(figure.subplots(1, len(labels), squeeze=False)[0])
-    # Of the longest variants the one with most tasks, hence one with a curriculum.
-    longest = max(
-        methods.values(), key=lambda v: (len(v.stage), len(np.unique(v.task)))
-    )
-    for axes, (metric, ylabel) in zip(panels, labels.items(), strict=True):
-        style.shade_tasks(axes, style.task_spans(longest))
-        axes.set(xlabel="iteration", ylabel=ylabel)
-        draw_metric(axes, methods, metric, interval=interval)
-    return figure, panels
+    """Panels of `labels`' metrics, _COLUMNS beside each other, tasks shaded."""
+    figure, n = Figure(figsize=size), len(labels)
+    columns, spans = min(_COLUMNS, n), shared_spans(methods)
+    grid = figure.subplots(math.ceil(n / columns), columns, squeeze=False)
+    for axes in grid.flat[n:]:
+        axes.set_axis_off()
+    family = next(variant.family for variant in methods.values())
+    for axes, (metric, ylabel) in zip(grid.flat, labels.items(), strict=False):
+        if spans:
+            style.shade_tasks(axes, spans)
+        draw_metric(axes, methods, metric, rows, interval)
+        axes.set(xlabel=COUNTED[family], ylabel=ylabel)
+        axes.margins(x=0.0)
+    return figure, list(grid.flat)
+
+
+def figure_curves(runs: Runs, env: str, family: str, tag: str | None = None) -> Figure:
+    """One panel per metric: mean and 95 % interval of every method, tasks shaded."""
+    methods = runs.tagged(env, family, tag)
+    labels = {metric: label(family, metric) for metric in metrics_of(methods)}
+    width = max(0.6, min(_COLUMNS, len(labels)) / 2) * style.TEXT_WIDTH
+    size = width, 2.5 * math.ceil(len(labels) / _COLUMNS) + 0.7
+    figure, _ = _panels(methods, labels, size, spread_rows, bootstrap_curves)
+    style.legend(figure, methods)
+    what = "mean over seeds, bootstrapped 95 % interval"
+    style.footer(figure, runs, methods, what)
+    return figure
 
 
 def figure_1(runs: Runs, tag: str | None = None) -> Figure:

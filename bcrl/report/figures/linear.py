@@ -9,7 +9,6 @@ from matplotlib.patches import Circle, Rectangle
 from bcrl.report.figures import style
 from bcrl.report.figures.curves import draw_metric
 from bcrl.report.variants import LINEAR, Methods, Runs, Variant
-from bcrl.results.read import Finding
 
 #: A learner's name in the records → in the figures; whose colour it has.
 _LEARNERS = {"lspi": "LSPI", "dqn": "DQN on LQ"}
@@ -101,23 +100,11 @@ def figure_4a(runs: Runs, tag: str | None = None) -> Figure:
 
 def prior(variant: Variant, seed: int) -> tuple[np.ndarray, ...]:
     """The first stage's Q of a seed on the x–y plane at zero velocity. Axes x (X,), y
-    (Y,), value max_a Q (X, Y) and the greedy action's force (X, Y, 2). Raises BcrlError
-    if the states are no whole x-major grid or the shapes disagree."""
+    (Y,), value max_a Q (X, Y) and the greedy action's force (X, Y, 2)."""
     states, q, actions = variant.arrays(seed, "states", "q_stages", "actions")
-    if q.ndim != 3 or q.shape[1:] != (len(states), len(actions)) or not len(q):
-        raise Finding(variant.npz(seed), f"has a q_stages of shape {q.shape}")
-    x, y = axes_of_grid(variant, seed, states[:, [0, 2]])  # state order x, ẋ, y, ẏ
+    x, y = np.unique(states[:, 0]), np.unique(states[:, 2])  # x, ẋ, y, ẏ; x-major
     force = actions[q[0].argmax(axis=1)]
     return x, y, q[0].max(axis=1).reshape(len(x), -1), force.reshape(len(x), -1, 2)
-
-
-def axes_of_grid(variant: Variant, seed: int, points: np.ndarray) -> list[np.ndarray]:
-    """x (X,) and y (Y,) of points (X · Y, 2); BcrlError unless the grid is x-major."""
-    x, y = (np.unique(column) for column in points.T)
-    grid = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
-    if grid.shape != points.shape or not np.allclose(grid, points):
-        raise Finding(variant.npz(seed), "has states that are no grid")
-    return [x, y]
 
 
 def _draw_prior(axes: Axes, learner: str, variant: Variant | None) -> None:
@@ -141,12 +128,8 @@ def _draw_prior(axes: Axes, learner: str, variant: Variant | None) -> None:
 
 def _draw_environment(axes: Axes, variant: Variant) -> None:
     """The target: strip, walls, goal, start region and drift."""
-    seed, names = min(variant.seeds), ("pathway", "goal", "start", "drift")
-    pathway, goal, start, drift = arrays = variant.arrays(seed, *names)
-    shapes = [np.shape(array) for array in arrays]
-    if shapes != [(4,), (3,), (4,), (2,)]:
-        raise Finding(variant.npz(seed), f"describes its target in shapes {shapes}")
-    x0, y0, x1, y1 = pathway
+    names = ("pathway", "goal", "start", "drift")
+    (x0, y0, x1, y1), goal, start, drift = variant.arrays(min(variant.seeds), *names)
     length, margin = x1 - x0, 0.08 * (x1 - x0)
     axes.set(xlim=(x0 - margin, x1 + margin), ylim=(y0 - length / 3, y1 + length / 3))
     axes.set_title("target task", pad=4)

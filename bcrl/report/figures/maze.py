@@ -8,9 +8,8 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Rectangle
 
 from bcrl.report.figures import style
-from bcrl.report.figures.linear import NO_RUNS, axes_of_grid
+from bcrl.report.figures.linear import NO_RUNS
 from bcrl.report.variants import METHODS, Methods, Runs, Variant
-from bcrl.results.read import Finding
 
 _MARGIN = 0.025  # half a lattice cell
 _SPREAD = 0.012  # how far apart the seeds' trajectories are drawn, in maze lengths
@@ -43,16 +42,10 @@ def _frame(axes: Axes, title: str) -> None:
 
 
 def seed_mean_value(variant: Variant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lattice axes x (X,), y (Y,) and max_a of the seed-mean Q there, (X, Y). Raises
-    BcrlError if a seed's states are not one whole x-major lattice."""
-    total = 0.0
-    for seed in variant.seeds:
-        states, q = variant.arrays(seed, "states", "q")
-        x, y = axes_of_grid(variant, seed, states)
-        if len(q) != len(states) or np.shape(total) not in ((), q.shape):
-            raise Finding(variant.npz(seed), f"has a q of shape {q.shape}")
-        total = total + q
-    value = (total / len(variant.seeds)).max(axis=1)
+    """Axes x (X,), y (Y,) of the x-major lattice, max_a of the seed-mean Q (X, Y)."""
+    loaded = [variant.arrays(seed, "states", "q") for seed in variant.seeds]
+    x, y = (np.unique(column) for column in loaded[0][0].T)
+    value = np.mean([q for _, q in loaded], axis=0).max(axis=1)
     return x, y, value.reshape(len(x), len(y))
 
 
@@ -63,10 +56,7 @@ def _draw_paths(axes: Axes, name: str, variant: Variant, goal: np.ndarray) -> No
     shifts = np.linspace(-_SPREAD, _SPREAD, n) if n > 1 else [0.0]
     look = {"color": style.colour(name), "linewidth": 0.7, "alpha": 0.6, "zorder": 3}
     for seed, shift in zip(variant.seeds, shifts, strict=True):
-        (path,) = variant.arrays(seed, "trajectory")
-        if path.shape[1:] != (2,) or not len(path):
-            what = f"has a trajectory of shape {path.shape}, expected (L, 2)"
-            raise Finding(variant.npz(seed), what)
+        (path,) = variant.arrays(seed, "trajectory")  # (L, 2)
         axes.plot(path[:, 0] + shift, path[:, 1] - shift, **look)
     _draw_ends(axes, goal, path[0])
     _frame(axes, f"{name}: {int(variant.last('solved').sum())} of {n} arrive")
