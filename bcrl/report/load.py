@@ -24,7 +24,7 @@ def load_runs(runs_dir: Path, scale: str, allow_incomplete: bool = False) -> Run
     checked, findings = check_tree(runs_dir, scale)
     rejected = [f for f in findings if f.kind == BROKEN or not allow_incomplete]
     if rejected:
-        raise BcrlError(_rejection(runs_dir, scale, rejected, allow_incomplete))
+        raise BcrlError(_rejection(runs_dir / scale, rejected))
     notes: list[Note] = []
     loaded = [_variant(each, notes) for each in checked]
     runs = Runs(scale, tuple(filter(None, loaded)), notes)
@@ -46,19 +46,15 @@ def load_runs(runs_dir: Path, scale: str, allow_incomplete: bool = False) -> Run
     return runs
 
 
-def _rejection(
-    runs_dir: Path, scale: str, rejected: list[Finding], allow_incomplete: bool
-) -> str:
+def _rejection(folder: Path, rejected: list[Finding]) -> str:
     """The message for findings that are not to be overlooked."""
-    lines = [f"nothing is drawn, because in {runs_dir / scale}:"]
+    lines = [f"nothing is drawn, because in {folder}:"]
     lines += [f"  {finding}" for finding in rejected[:LISTED]]
     if (more := len(rejected) - LISTED) > 0:
-        shown = shlex.join(["bcrl-verify", str(runs_dir)])
+        shown = shlex.join(["bcrl-verify", str(folder.parent)])
         lines.append(f"  and {more} more; `{shown}` lists all")
     if any(finding.kind == INCOMPLETE for finding in rejected):
         lines.append("--allow-incomplete draws what is complete and says so in figures")
-    if allow_incomplete:
-        lines.append("broken files are rejected with --allow-incomplete, too")
     return "\n".join(lines)
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from bcrl.report.variants import COMPARED, Methods, Note
+from bcrl.report.variants import COMPARED, Methods, Note, Runs
 from bcrl.results.layout import spelled
 
 
@@ -21,23 +21,21 @@ def tags_shown(methods: Methods) -> str:
     return f"@{tag}: {', '.join(n for n, v in methods.items() if v.tag == tag)}"
 
 
-def remarks(
-    notes: Iterable[Note], methods: Methods, compares: bool = True
-) -> list[str]:
+def remarks(runs: Runs, methods: Methods, compares: bool = True) -> list[str]:
     """The lines that belong under a figure of `methods`, which may be of several tags.
     `compares`: differences between methods belong to it too."""
     env, family = next((v.env, v.family) for v in methods.values())
     tags = {v.tag for v in methods.values()}
 
     def belongs(note: Note) -> bool:
-        if note.method in methods:
-            return methods[note.method].tag == note.tag
+        if note.method in methods and methods[note.method].tag == note.tag:
+            return True
         if note.method:  # it isn't drawn: perhaps it has no complete seed
             awaited = note.method in COMPARED.get((env, family), ())
             return compares and note.incomplete and awaited and note.tag in tags
         return compares and note.family == family and {note.tag} == tags
 
-    shown = [note for note in notes if note.env == env and belongs(note)]
+    shown = [note for note in runs.notes if note.env == env and belongs(note)]
     if compares and len(tags) > 1:  # no notes were made for such a mixture yet
         shown += across_methods(methods, methods, env, None, family)
     odd = [note.footer for note in shown if note.footer and not note.incomplete]

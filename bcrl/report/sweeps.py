@@ -52,7 +52,7 @@ def sweep_table(runs: Runs) -> pd.DataFrame:
 
 def _texts(variant: Variant) -> dict[str, str]:
     """Dotted keys of a variant's config → values as JSON, strings without quotes."""
-    config = variant.sidecars[0].get("config") or {}
+    config = variant.sidecars[0]["config"]
     kept = flat({k: v for k, v in config.items() if k not in _IGNORED})
     return {k: json.dumps(v, ensure_ascii=False).strip('"') for k, v in kept.items()}
 

@@ -9,12 +9,7 @@ import pandas as pd
 import yaml
 from scipy import stats
 
-from bcrl.report.statistics import (
-    FEWEST_SEEDS,
-    Interval,
-    bootstrap,
-    standard_error,
-)
+from bcrl.report.statistics import FEWEST_SEEDS, Interval, bootstrap, standard_error
 from bcrl.report.variants import WINDOW, Runs
 from bcrl.results.layout import INDEX
 

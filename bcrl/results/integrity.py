@@ -12,17 +12,9 @@ import pandas as pd
 import yaml
 
 from bcrl.common.identity import differences, identity
-from bcrl.results import layout
+from bcrl.results import layout, read
 from bcrl.results.layout import requested, seed_path, state_of
-from bcrl.results.read import (
-    AGAIN,
-    INCOMPLETE,
-    Document,
-    Finding,
-    read_csv,
-    read_document,
-    read_recorded,
-)
+from bcrl.results.read import AGAIN, INCOMPLETE, Document, Finding
 
 _SHOWN_KEYS = 3  # differing keys of a config that are named
 _NAME = re.compile(rf"{layout.SEED}([0-9]+)\.({'|'.join(layout.SUFFIXES)})")
@@ -83,13 +75,13 @@ def check_folder(folder: Path) -> Checked:
     for seed in sorted(numbers):
         csv, npz = (seed_path(folder, seed, suffix) for suffix in ("csv", "npz"))
         try:
-            documents[seed] = document = read_document(folder, seed)
+            documents[seed] = document = read.read_document(folder, seed)
             state = state_of(document)
             if state != layout.RUNNING and "sha256" in document:
-                read_recorded(npz, document)
-                read_recorded(csv, document)
+                read.read_recorded(npz, document)
+                read.read_recorded(csv, document)
             if state == layout.COMPLETE:
-                tables[seed] = read_csv(csv, document)
+                tables[seed] = read.read_csv(csv, document)
         except Finding as finding:
             findings.append(finding)
     findings += [*_config_findings(folder, documents), *_index_findings(folder, tables)]

@@ -247,6 +247,23 @@ def test_verdicts(low, high, expect, expected):
 # --- what is incomplete, odd or broken
 
 
+def test_a_diverging_method_is_named_and_cut_off(tmp_path):
+    def far(env, method, seed, stage):
+        curves = as_the_paper_says(env, method, seed, stage)
+        if method == "B-FQI":
+            curves["q_error"] *= 1000.0 ** (stage - 1)
+        return curves
+
+    write_fqi(tmp_path, "car_on_hill", curves=far)
+    runs = load_runs(tmp_path, "smoke")
+    (note,) = runs.notes
+    assert "B-FQI: diverges, q_error up to 4.5" in note.text
+    with style.sheet():
+        axes = curves.figure_1(runs).axes[0]
+    assert axes.get_ylim()[1] < 1.0
+    assert "cut: B-FQI diverges" in {text.get_text() for text in axes.texts}
+
+
 def folder_of(runs_dir: Path, method: str) -> Path:
     return runs_dir / "smoke" / "car_on_hill" / method
 

@@ -6,20 +6,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from bcrl.report import tables
 from bcrl.report.claims.judge import CLAIMS, TITLES, judged
 from bcrl.report.notes import incomplete, tags_shown
 from bcrl.report.statistics import share_interval
-from bcrl.report.tables import (
-    ABSENT,
-    TEXTS,
-    Section,
-    TextTable,
-    duration,
-    interquartile_mean,
-    mean_cell,
-    number,
-    seeds_cell,
-)
+from bcrl.report.tables import ABSENT, TEXTS, Section, TextTable, number
 from bcrl.report.variants import LINEAR, Note, Runs, Variant
 
 #: Columns that come with the interquartile mean.
@@ -73,7 +64,7 @@ def claims_sections(runs: Runs, tag: str | None) -> dict[tuple[str, str], Sectio
         parts += [f"{len(rows)} claims: {counted}.\n", TextTable(rows)]
         parts += _values(variants)
         seconds = sum(variant.cpu_seconds for variant in variants)
-        parts.append(f"CPU time of these runs: {duration(seconds)}.\n")
+        parts.append(f"CPU time of these runs: {tables.duration(seconds)}.\n")
         found[env, family] = Section(TITLES[env], parts)
     return found
 
@@ -83,11 +74,12 @@ def _values(variants: Iterable[Variant]) -> list[str | TextTable]:
     common = set.intersection(*(set(v.metrics) for v in variants))
     rows = []
     for variant in variants:
-        n, measured = len(variant.seeds), _measured(variant)
-        row = {"method": variant.name, "seeds": seeds_cell(n, len(variant.failed))}
-        row |= {name: mean_cell(values) for name, values in measured.items()}
+        n, failed = len(variant.seeds), len(variant.failed)
+        measured = _measured(variant)
+        row = {"method": variant.name, "seeds": tables.seeds_cell(n, failed)}
+        row |= {name: tables.mean_cell(values) for name, values in measured.items()}
         for name in (name for name in _WITH_IQM if name in measured):
-            row[f"{name}, IQM"] = interquartile_mean(measured[name])
+            row[f"{name}, IQM"] = tables.interquartile_mean(measured[name])
         if "solved" in common:
             hits = int((variant.last("solved") > 0).sum())
             low, high = map(number, share_interval(hits, n))

@@ -5,14 +5,9 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from bcrl.report import statistics
 from bcrl.report.notes import listed
-from bcrl.report.statistics import (
-    FEWEST_SEEDS,
-    Interval,
-    bootstrap,
-    share_difference_interval,
-    share_interval,
-)
+from bcrl.report.statistics import FEWEST_SEEDS, Interval
 from bcrl.report.tables import ABSENT, estimate
 from bcrl.report.variants import Methods, Variant
 
@@ -115,12 +110,13 @@ def _measured(quantity: str, variants: list[Variant]) -> tuple[float, Interval, 
     first, *rest = (float(statistic(each)) for each in values)
     value = first - rest[0] if rest else first
     if values[0].dtype != bool:
-        return value, bootstrap(*values, statistic=statistic), ""
+        return value, statistics.bootstrap(*values, statistic=statistic), ""
     (hits, n), *others = counts = [(int(v.sum()), len(v)) for v in values]
     if others:
         shown = " against ".join(f"{k}/{n}" for k, n in counts)
-        return value, share_difference_interval(hits, n, *others[0]), f" ({shown})"
-    return value, share_interval(hits, n), f" ({hits} of {n} seeds)"
+        interval = statistics.share_difference_interval(hits, n, *others[0])
+        return value, interval, f" ({shown})"
+    return value, statistics.share_interval(hits, n), f" ({hits} of {n} seeds)"
 
 
 def verdict(value: float, interval: Interval, expect: str, seeds: int) -> str:

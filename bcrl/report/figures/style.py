@@ -128,14 +128,12 @@ def footer(
     """Small print: environment, scale, number of seeds, `what` is drawn, what is odd.
     `compares`: differences between methods belong to it."""
     env = next(v.env for v in methods.values())
-    n, *others = counts = [len(v.seeds) for v in methods.values()]
-    seeds = f"{n} seed{'s' * (n != 1)}{' per method' if others else ''}"
-    if len(set(counts)) > 1:
-        named = zip(methods, counts, strict=True)
-        seeds = "seeds " + ", ".join(f"{name} {n}" for name, n in named)
+    counts = [len(v.seeds) for v in methods.values()]
+    n = "–".join(map(str, sorted({min(counts), max(counts)})))
+    seeds = f"{n} seed{'s' * (n != '1')}{' per method' * (len(counts) > 1)}"
     parts = [env_title(env), f"scale {runs.scale}", seeds, tags_shown(methods), what]
     lines = [" · ".join(filter(None, parts))]
-    lines += remarks(runs.notes, methods, compares)
+    lines += remarks(runs, methods, compares)
     limit = int(figure.get_figwidth() * _FOOTER_WIDTH)
     text = "\n".join(part for line in lines for part in textwrap.wrap(line, limit))
     figure.supxlabel(text, x=0.01, ha="left", fontsize=6.5, color="0.35")
