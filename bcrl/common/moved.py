@@ -27,6 +27,7 @@ MOVED |= {
     "bcrl.q.mlp": "bcrl.q.networks.mlp",
     "bcrl.q.regression": "bcrl.q.regressors.base",
     "bcrl.q.scikit": "bcrl.q.regressors.scikit",
+    "bcrl.report.verify": "bcrl.results.verify",
     "bcrl.streams": "bcrl.common.seeding",
 }
 

@@ -1,86 +1,64 @@
-"""Statistics over seeds: means, standard errors, bootstrap and score intervals."""
-
-from __future__ import annotations
+"""Statistics over seeds: standard errors, bootstrap and score intervals."""
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
 _RESAMPLES = 10_000
 LEVEL = 0.95
 MOST_DRAWS = 4_000_000  # resampled seeds that are held in memory at a time
 _SEED = 20_220_425  # every interval draws from its own generator, started from this
+#: Below this a percentile bootstrap is far too narrow: no verdict is given.
+FEWEST_SEEDS = 5
+Interval = tuple[float, float]  # closed; both ends are nan where the data allow none
 
 
-class Interval(NamedTuple):
-    """A closed interval; both ends are nan where the data allow none."""
-
-    low: float
-    high: float
-
-
-NONE = Interval(math.nan, math.nan)
-
-
-def standard_error(values: NDArray[np.float64], ddof: int = 0) -> NDArray[np.float64]:
-    """Standard error of the mean over seeds: (S, …) → (…), nan if S ≤ ddof.
-
-    The paper's figures have ddof = 0, as its released evaluation; tables have 1.
-    """
+def standard_error(values: np.ndarray, ddof: int = 0) -> np.ndarray:
+    """Standard error of the mean over seeds: (S, …) → (…), nan if S ≤ ddof. The paper's
+    figures have ddof = 0, as its released evaluation; tables have 1."""
     if len(values) <= ddof:
         return np.full(values.shape[1:], math.nan)
     return np.std(values, axis=0, ddof=ddof) / math.sqrt(len(values))
 
 
-def interquartile_mean(values: ArrayLike) -> float:
-    """Mean of (S,) values without the lowest and the highest ⌊S/4⌋ of them."""
-    return float(stats.trim_mean(values, 0.25))
-
-
 def bootstrap(
-    values: ArrayLike,
-    minus: ArrayLike | None = None,
-    statistic: Callable[..., NDArray[np.float64]] = np.mean,
+    *samples: ArrayLike, statistic: Callable[..., np.ndarray] = np.mean
 ) -> Interval:
-    """95 % percentile bootstrap interval of a statistic of (S,) independent seeds.
+    """95 % percentile bootstrap interval of a statistic of (S,) independent seeds. With
+    two samples: of the difference of their statistics. They are resampled
+    independently: seeds are not paired across methods. nan for fewer than two seeds and
+    for non-finite values (Efron and Tibshirani 1993, chapter 13)."""
+    given = [np.asarray(sample, float) for sample in samples]
+    if not all(len(sample) > 1 and np.isfinite(sample).all() for sample in given):
+        return math.nan, math.nan
 
-    With another sample (S2,) `minus`: of the difference of both samples' statistics.
-    The samples are resampled independently: seeds are not paired across methods. nan
-    for fewer than two seeds and for non-finite values (Efron and Tibshirani 1993,
-    chapter 13).
-    """
-    samples = [np.asarray(s, float) for s in (values, minus) if s is not None]
-    if not all(len(s) > 1 and np.isfinite(s).all() for s in samples):
-        return NONE
-
-    def of(*drawn: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    def of(*drawn: np.ndarray, axis: int) -> np.ndarray:
         first, *rest = (statistic(each, axis=axis) for each in drawn)
         return first - rest[0] if rest else first
 
     found = stats.bootstrap(
-        samples,
+        given,
         of,
         n_resamples=_RESAMPLES,
-        batch=max(1, MOST_DRAWS // max(map(len, samples))),
+        batch=max(1, MOST_DRAWS // max(map(len, given))),
         vectorized=True,
         confidence_level=LEVEL,
         method="percentile",
         rng=np.random.default_rng(_SEED),
     )
-    return Interval(*map(float, found.confidence_interval))
+    low, high = found.confidence_interval
+    return float(low), float(high)
 
 
 def bootstrap_curves(
-    values: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    values: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """`bootstrap` of the mean at every point of (S, I) curves: both ends, (I,) each.
-
-    One draw of the seeds serves all points; SciPy's bootstrap takes four times as long.
-    """
+    One draw of the seeds serves all points; SciPy's bootstrap takes four times as
+    long."""
     n = len(values)
     if n < 2:
         return np.full((2, values.shape[1]), math.nan)
@@ -96,21 +74,15 @@ def bootstrap_curves(
 
 
 def share_interval(successes: int, n: int) -> Interval:
-    """95 % Wilson score interval of a share.
-
-    Used for shares of seeds, where the bootstrap of 0 of n has no width (Wilson 1927).
-    """
-    if n == 0:
-        return NONE
+    """95 % Wilson score interval of a share. Used for shares of seeds, where the
+    bootstrap of 0 of n has no width (Wilson 1927)."""
     found = stats.binomtest(successes, n).proportion_ci(LEVEL, method="wilson")
-    return Interval(float(found.low), float(found.high))
+    return float(found.low), float(found.high)
 
 
 def share_difference_interval(k1: int, n1: int, k2: int, n2: int) -> Interval:
     """95 % interval of k1/n1 − k2/n2 from two Wilson intervals (Newcombe 1998)."""
-    if min(n1, n2) == 0:
-        return NONE
     p1, p2 = k1 / n1, k2 / n2
     (l1, u1), (l2, u2) = share_interval(k1, n1), share_interval(k2, n2)
     low = p1 - p2 - math.hypot(p1 - l1, u2 - p2)
-    return Interval(low, p1 - p2 + math.hypot(u1 - p1, p2 - l2))
+    return low, p1 - p2 + math.hypot(u1 - p1, p2 - l2)

@@ -1,157 +1,95 @@
 """Searches: variants of one method beside each other, with what they differ in."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from bcrl.common.identity import OUTPUT_KEYS, flat
-from bcrl.report.late import WINDOW, late
 from bcrl.report.statistics import bootstrap
-from bcrl.report.tables import ABSENT, Section, TextTable, mean_cell, seeds_cell
+from bcrl.report.tables import ABSENT, Section, TextTable, estimate, seeds_cell
 from bcrl.report.variants import Runs, Variant
 from bcrl.results.layout import spelled
 
-#: The return that ranks variants, by family.
-_DECISIVE = {"FQI": "last return", "DQN": "late return"}
+#: The mean that ranks variants, by family.
+_DECISIVE = {"FQI": "last_return", "DQN": "late_return"}
 _IGNORED = (*OUTPUT_KEYS, "scale")  # top-level keys of a config that all may differ in
 
-SWEEPS_PREAMBLE = f"""\
-Variants of one method that differ in their configuration, compared over the seeds
-named in their rows. *Late*: a seed's mean over the evaluations of its last {WINDOW}
-environment steps; *last*: the last evaluation or iteration. Brackets are 95 %
-percentile bootstrap intervals over seeds; the best mean of a group is **bold**: late
-for the DQN family, last for FQI. Chance flatters the best of many: test it on other
-seeds.
-"""
 
-
-@dataclass(frozen=True)
-class Group:
-    """One method's variants in one environment and the settings they differ in.
-
-    `keys` are dotted; `settings` maps a variant's name to its values of them, as text.
-    """
-
-    env: str
-    method: str
-    variants: tuple[Variant, ...]
-    keys: tuple[str, ...]
-    settings: dict[str, tuple[str, ...]]
-
-    @property
-    def best(self) -> Variant | None:
-        """The variant with the largest mean return, None if all are non-finite."""
-        ranked = {}
-        for variant in self.variants:
-            values = measured(variant)[_DECISIVE[variant.family]]
-            if values is not None and np.isfinite(values.mean()):
-                ranked[variant.name] = values.mean()
-        best = max(ranked, key=lambda name: ranked[name], default=None)
-        return next((v for v in self.variants if v.name == best), None)
-
-
-def measured(variant: Variant) -> dict[str, NDArray[np.float64] | None]:
-    """Late and last return and success rate, (S,) each; None for what FQI lacks."""
-    metrics, dqn = variant.metrics, variant.family == "DQN"
-    success = variant.last("solved") if "solved" in metrics else None
-    return {
-        "late return": late(variant, "return") if dqn else None,
-        "last return": variant.last("return") if "return" in metrics else None,
-        "success rate": late(variant, "success_rate") if dqn else success,
-    }
-
-
-def groups(runs: Runs) -> list[Group]:
-    """Methods with more than one variant, in the order of environment and method."""
+def sweep_table(runs: Runs) -> pd.DataFrame:
+    """One row per variant of the methods that have more than one; perhaps empty.
+    Settings as JSON text, seeds, then late and last return and success rate (nan for
+    what FQI lacks): their means over seeds and the ends of their intervals."""
     together: dict[tuple[str, str], list[Variant]] = {}
     for variant in runs.variants:
         together.setdefault((variant.env, variant.method), []).append(variant)
-    found = []
-    for (env, method), variants in together.items():
-        texts = {v.name: _texts(v) for v in variants}
-        known = dict.fromkeys(key for each in texts.values() for key in each)
-        differ = [k for k in known if len({t.get(k) for t in texts.values()}) > 1]
-        settings = {
-            n: tuple(t.get(k, ABSENT) for k in differ) for n, t in texts.items()
-        }
-        if len(variants) > 1:
-            found.append(Group(env, method, tuple(variants), tuple(differ), settings))
-    return found
-
-
-def _texts(variant: Variant) -> dict[str, str]:
-    """Dotted keys of a variant's config → values as JSON, strings without quotes."""
-    config = variant.sidecars[0].get("config") or {}
-    kept = flat({k: v for k, v in config.items() if k not in _IGNORED})
-    return {k: json.dumps(v, ensure_ascii=False).strip('"') for k, v in kept.items()}
-
-
-def sweep_sections(found: list[Group]) -> Iterator[Section]:
-    """Per group: how many variants, which is best, and a table of all."""
-    for group in found:
-        used = {spelled(variant.seeds) for variant in group.variants}
-        same = f"Seeds {used.pop()}." if len(used) == 1 else "Seeds differ by row."
-        text = f"{len(group.variants)} variants. {same}"
-        if (best := group.best) is not None:
-            pairs = zip(group.keys, group.settings[best.name], strict=True)
-            chosen = ", ".join(f"{key} = {value}" for key, value in pairs)
-            text += f" Best: {best.name}{f' ({chosen})' if chosen else ''}."
-        rows = [_row(group, variant) for variant in group.variants]
-        header = [
-            "variant",
-            *group.keys,
-            "seeds · number",
-            *measured(group.variants[0]),
-        ]
-        table = TextTable(header, rows)
-        yield Section(f"{group.env}: {group.method}", [f"{text}\n", table])
-
-
-def _row(group: Group, variant: Variant) -> list[str]:
-    seeds = f"{spelled(variant.seeds)} · {seeds_cell(variant)}"
-    cells = {name: mean_cell(values) for name, values in measured(variant).items()}
-    if variant is group.best:
-        cells[_DECISIVE[variant.family]] = f"**{cells[_DECISIVE[variant.family]]}**"
-    return [variant.name, *group.settings[variant.name], seeds, *cells.values()]
-
-
-def sweep_report(runs: Runs, found: list[Group]) -> str:
-    """The Markdown document of all groups, and the notes on their runs."""
-    parts = [f"# Variants compared, scale {runs.scale}\n", SWEEPS_PREAMBLE]
-    parts += map(str, sweep_sections(found))
-    ours = {(group.env, group.method) for group in found}
-    odd = [n.text for n in runs.notes if (n.env, n.method) in ours]
-    if odd:
-        parts.append("## Notes on these runs\n")
-        parts.append("\n".join(f"- {text}" for text in odd) + "\n")
-    return "\n".join(parts)
-
-
-def sweep_table(found: list[Group]) -> pd.DataFrame:
-    """One row per variant: settings as JSON text, seeds, means and their intervals."""
-    rows = []
-    for group in found:
-        for variant in group.variants:
-            settings = zip(group.keys, group.settings[variant.name], strict=True)
+    rows, decisive = [], []
+    for variants in (group for group in together.values() if len(group) > 1):
+        texts = pd.DataFrame([_texts(variant) for variant in variants])
+        differing = texts.loc[:, texts.nunique(dropna=False) > 1].fillna(ABSENT)
+        chosen = differing.T.to_dict().values()
+        for variant, settings in zip(variants, chosen, strict=True):
             row: dict[str, object] = {
-                "env": group.env,
-                "method": group.method,
+                "env": variant.env,
+                "method": variant.method,
                 "variant": variant.name,
-                "settings": json.dumps(dict(settings), ensure_ascii=False),
+                "settings": json.dumps(settings, ensure_ascii=False),
                 "seeds": spelled(variant.seeds),
                 "complete": len(variant.seeds),
                 "failed": len(variant.failed),
             }
-            for label, values in measured(variant).items():
-                name = label.replace(" ", "_")
-                given = np.array([np.nan]) if values is None else values
-                low, high = bootstrap(given)
-                row |= {name: given.mean(), f"{name}_low": low, f"{name}_high": high}
-            rows.append(row | {"best": variant is group.best})
-    return pd.DataFrame(rows)
+            for name, values in _measured(variant).items():
+                low, high = bootstrap(values)
+                row |= {name: values.mean(), f"{name}_low": low, f"{name}_high": high}
+            rows.append(row)
+            decisive.append(row[_DECISIVE[variant.family]])
+    table = pd.DataFrame(rows)
+    if rows:
+        groups = pd.Series(decisive).groupby([table["env"], table["method"]])
+        table["best"] = groups.rank(ascending=False, method="first") == 1
+    return table
+
+
+def _texts(variant: Variant) -> dict[str, str]:
+    """Dotted keys of a variant's config → values as JSON, strings without quotes."""
+    config = variant.sidecars[0]["config"]
+    kept = flat({k: v for k, v in config.items() if k not in _IGNORED})
+    return {k: json.dumps(v, ensure_ascii=False).strip('"') for k, v in kept.items()}
+
+
+def _measured(variant: Variant) -> dict[str, np.ndarray]:
+    """Late and last return and success rate, (S,) each; nan for what FQI lacks."""
+    dqn, nothing = variant.family == "DQN", np.array([np.nan])
+    success = variant.metrics.get("solved", nothing[None])[:, -1]
+    last = variant.metrics.get("return", nothing[None])[:, -1]
+    return {
+        "late_return": variant.late("return") if dqn else nothing,
+        "last_return": last,
+        "success_rate": variant.late("success_rate") if dqn else success,
+    }
+
+
+def sweep_sections(table: pd.DataFrame) -> list[Section]:
+    """Per method: how many variants, which is best, and a table of all."""
+    found = []
+    groups = table.groupby(["env", "method"], sort=False) if len(table) else ()
+    for (env, method), group in groups:
+        same = group["seeds"].nunique() == 1
+        used = f"Seeds {group['seeds'].iloc[0]}." if same else "Seeds differ by row."
+        text, rows = f"{len(group)} variants. {used}", []
+        for row in group.to_dict("records"):
+            settings = json.loads(row["settings"])
+            seeds = f"{row['seeds']} · {seeds_cell(row['complete'], row['failed'])}"
+            cells = {"variant": row["variant"], **settings, "seeds · number": seeds}
+            for name in ("late_return", "last_return", "success_rate"):
+                interval = row[f"{name}_low"], row[f"{name}_high"]
+                cells[name.replace("_", " ")] = estimate(row[name], interval)
+            if row["best"]:
+                fqi = np.isnan(row["late_return"])
+                decisive = "last return" if fqi else "late return"
+                cells[decisive] = f"**{cells[decisive]}**"
+                chosen = ", ".join(f"{key} = {v}" for key, v in settings.items())
+                text += f" Best: {row['variant']}{f' ({chosen})' if chosen else ''}."
+            rows.append(cells)
+        found.append(Section(f"{env}: {method}", [f"{text}\n", TextTable(rows)]))
+    return found

@@ -1,33 +1,37 @@
 """Tables of text, cells with intervals, and the long-form aggregate over seeds."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+import yaml
+from scipy import stats
 
-from bcrl.report.statistics import Interval, bootstrap, standard_error
-from bcrl.report.variants import Methods, Runs, Variant
+from bcrl.report.statistics import FEWEST_SEEDS, Interval, bootstrap, standard_error
+from bcrl.report.variants import WINDOW, Runs
 from bcrl.results.layout import INDEX
 
 ABSENT = "–"  # a cell without a value
+_TEXTS = Path(__file__).with_name("templates") / "texts.yaml"
+#: Paragraphs of the documents and the page, by name.
+TEXTS = {
+    name: text.format(fewest=FEWEST_SEEDS, window=WINDOW)
+    for name, text in yaml.safe_load(_TEXTS.read_text("utf-8")).items()
+}
 
 
 class TextTable(NamedTuple):
-    """Cells of text; as a string it is Markdown, with bars inside cells escaped."""
+    """Rows from a column's header to its cell; as a string it is Markdown."""
 
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    rows: Sequence[Mapping[str, str]]
 
     def __str__(self) -> str:
-        def line(cells: Sequence[str]) -> str:
-            return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
-        rule = "|" + "---|" * len(self.header)
-        return "\n".join([line(self.header), rule, *map(line, self.rows)]) + "\n"
+        first, *_ = rows = self.rows
+        lines = [[*first], ["---"] * len(first), *(row.values() for row in rows)]
+        cells = [[cell.replace("|", "\\|") for cell in line] for line in lines]
+        return "".join(f"| {' | '.join(line)} |\n" for line in cells)
 
 
 class Section(NamedTuple):
@@ -38,14 +42,6 @@ class Section(NamedTuple):
 
     def __str__(self) -> str:
         return "\n".join([f"## {self.title}\n", *map(str, self.parts)])
-
-
-def by_method(
-    methods: Methods, columns: Mapping[str, Callable[[Variant], str]]
-) -> TextTable:
-    """One row per method: its variant's name, then the cell of every column."""
-    rows = [[v.name, *(cell(v) for cell in columns.values())] for v in methods.values()]
-    return TextTable(["method", *columns], rows)
 
 
 def number(value: float) -> str:
@@ -59,14 +55,17 @@ def estimate(value: float, interval: Interval) -> str:
     """`0.12 [0.10, 0.14]`, without the brackets if there is no interval."""
     if not np.isfinite(interval).all():
         return number(value)
-    return f"{number(value)} [{number(interval.low)}, {number(interval.high)}]"
+    return f"{number(value)} [{number(interval[0])}, {number(interval[1])}]"
 
 
-def mean_cell(values: NDArray[np.float64] | None) -> str:
-    """Mean of (S,) values over seeds with its interval; a dash if there are none."""
-    if values is None:
-        return ABSENT
-    return estimate(float(values.mean()), bootstrap(values))
+def mean_cell(values: np.ndarray) -> str:
+    """Mean of (S,) values over seeds with its interval."""
+    return estimate(values.mean(), bootstrap(values))
+
+
+def interquartile_mean(values: np.ndarray) -> str:
+    """Mean of (S,) values without the lowest and the highest ⌊S/4⌋ of them."""
+    return number(stats.trim_mean(values, 0.25))
 
 
 def duration(seconds: float) -> str:
@@ -74,36 +73,31 @@ def duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
 
 
-def seeds_cell(variant: Variant) -> str:
+def seeds_cell(complete: int, failed: int) -> str:
     """`100`, or `97 (3 failed)` if some diverged."""
-    failed = f" ({len(variant.failed)} failed)" if variant.failed else ""
-    return f"{len(variant.seeds)}{failed}"
+    return f"{complete} ({failed} failed)" if failed else f"{complete}"
 
 
 def aggregate(runs: Runs, family: str = "FQI") -> pd.DataFrame:
-    """Mean and standard error over seeds of every metric at every evaluation.
-
-    One row per (variant, iteration or step, metric), tagged variants included. A mean
-    over a non-finite value is empty, as is the standard error (ddof = 1) of one seed.
-    """
+    """Mean and standard error over seeds of every metric at every evaluation. One row
+    per (variant, iteration or step, metric), tagged variants included. A mean over a
+    non-finite value is empty, as is the standard error (ddof = 1) of one seed."""
     *_, counter = INDEX[family]
     blocks = [
-        pd.DataFrame(
-            {
-                "scale": runs.scale,
-                "env": variant.env,
-                "variant": variant.name,
-                "stage": variant.stage,
-                "task": variant.task,
-                counter: variant.index,
-                "metric": metric,
-                "seeds": len(variant.seeds),
-                "mean": values.mean(axis=0),
-                "standard_error": standard_error(values, ddof=1),
-            }
-        )
+        {
+            "scale": runs.scale,
+            "env": variant.env,
+            "variant": variant.name,
+            "stage": variant.stage,
+            "task": variant.task,
+            counter: variant.index,
+            "metric": metric,
+            "seeds": len(variant.seeds),
+            "mean": values.mean(axis=0),
+            "standard_error": standard_error(values, ddof=1),
+        }
         for variant in runs.variants
         if variant.family == family
         for metric, values in variant.metrics.items()
     ]
-    return pd.concat(blocks, ignore_index=True)
+    return pd.concat(map(pd.DataFrame, blocks), ignore_index=True)

@@ -1,10 +1,7 @@
 """Arguments of `bcrl-report` and `bcrl-verify`: `key=VALUE` or `--key VALUE`."""
 
-from __future__ import annotations
-
 import argparse
 import sys
-from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
@@ -12,14 +9,8 @@ from typing import NoReturn
 from bcrl import __version__
 from bcrl.errors import BcrlError, closest
 
-#: Words that people type → the flag that they mean.
-_HABITS = {
-    "help": "--help",
-    "version": "--version",
-    "v": "--version",
-    "output": "--out",
-}
-_HABITS |= {"out_dir": "--out", "results": "--runs-dir", "dir": "--runs-dir"}
+#: Words that people type → the flag that they mean, where none is like them.
+_HABITS = {"v": "--version", "out-dir": "--out", "results": "--runs-dir"}
 _SCALES = ("smoke", "quick", "paper", "search")
 
 
@@ -33,42 +24,38 @@ class ResultsParser(argparse.ArgumentParser):
         add, runs = self.add_argument, Path("runs")
         add("--runs-dir", type=Path, default=runs, metavar="PATH", help=text)
 
-    def parsed(self, words: Sequence[str] | None = None) -> Namespace:
+    def parsed(self, words: Sequence[str] | None = None) -> argparse.Namespace:
         """The options in `words` or on the command line; BcrlError for a bad one."""
-        given = [self._spelt(w) for w in (sys.argv[1:] if words is None else words)]
+        flags = [flag for each in self._actions for flag in each.option_strings]
+        given = []
+        for word in sys.argv[1:] if words is None else words:
+            key, equals, value = word.partition("=")
+            flag = f"--{key.removeprefix('--').replace('_', '-')}"
+            known = flag in flags and (equals or key.startswith("--"))
+            given.append(flag + equals + value if known else word)
         options, left = self.parse_known_args(given)
         if left:
-            place = given.index(left[0]) if left[0] in given else len(given) - 1
-            word, after = given[place], "".join(given[place + 1 : place + 2])
-            raise BcrlError(f"{word}: unknown; {self._meant(word, after)}")
+            word = left[0]
+            after = given[given.index(word) + 1 :] if word in given else []
+            meant = _meant(word, "".join(after[:1]), flags)
+            meant = f"did you mean {meant}?" if meant else f"see {self.prog} --help"
+            raise BcrlError(f"{word}: unknown; {meant}")
         return options
 
     def error(self, message: str) -> NoReturn:
         """Raise BcrlError."""
         raise BcrlError(f"{message}; see {self.prog} --help")
 
-    def _flags(self) -> list[str]:
-        return [flag for each in self._actions for flag in each.option_strings]
 
-    def _spelt(self, word: str) -> str:
-        """`runs_dir=PATH` and `--runs_dir=PATH` as `--runs-dir=PATH`."""
-        key, equals, value = word.partition("=")
-        flag = f"--{key.removeprefix('--').replace('_', '-')}"
-        known = flag in self._flags() and (equals or key.startswith("--"))
-        return flag + equals + value if known else word
-
-    def _meant(self, word: str, after: str) -> str:
-        """What an unknown word may mean, as the words to type."""
-        key, _, value = word.lstrip("+-").partition("=")
-        value, name = value or after, key.lower().replace("-", "_").rstrip(":")
-        flags = self._flags()
-        flag = _HABITS.get(name) or closest(f"--{name.replace('_', '-')}", flags, 0.6)
-        if "--scale" in flags and (scale := closest(word, _SCALES, 0.8)):
-            flag, value = "--scale", scale
-        elif Path(word).is_dir() and not word.startswith("-"):
-            flag, value = "--runs-dir", word
-        if flag not in flags:
-            return f"see {self.prog} --help"
-        if flag == "--runs-dir":
-            return f"did you mean runs_dir={value or 'PATH'}?"
-        return f"did you mean {' '.join(filter(None, (flag, value)))}?"
+def _meant(word: str, after: str, flags: Sequence[str]) -> str:
+    """What an unknown word may mean, as the words to type; empty if unknown."""
+    key, _, value = word.lstrip("+-").partition("=")
+    name = key.lower().replace("_", "-").rstrip(":")
+    flag, value = _HABITS.get(name) or closest(f"--{name}", flags, 0.6), value or after
+    if "--scale" in flags and (scale := closest(word, _SCALES, 0.8)):
+        flag, value = "--scale", scale
+    elif Path(word).is_dir() and not word.startswith("-"):
+        flag, value = "--runs-dir", word
+    if flag == "--runs-dir":
+        return f"runs_dir={value or 'PATH'}"
+    return f"{flag} {value}".rstrip() if flag in flags else ""

@@ -7,8 +7,6 @@
     seed_0007.json   status, config, versions, SHA-256 of the others; written last
 """
 
-from __future__ import annotations
-
 from collections.abc import Container, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -42,14 +40,14 @@ DQN_METRICS = (
 MAY_BE_NAN = ("q_mean", "loss")
 
 
-def seed_path(folder: Path, seed: int, suffix: str) -> Path:
-    """`seed_0007.csv` and its companions in a variant's folder."""
-    return folder / f"{seed_name(seed)}.{suffix}"
-
-
 def seed_name(seed: int) -> str:
     """`seed_0007`: a seed's files without their suffix, and its folder of logs."""
     return f"{SEED}{seed:04d}"
+
+
+def seed_path(folder: Path, seed: int, suffix: str) -> Path:
+    """`seed_0007.csv` and its companions in a variant's folder."""
+    return folder / f"{seed_name(seed)}.{suffix}"
 
 
 def recorded_seeds(folder: Path, suffix: str) -> list[int]:
@@ -57,11 +55,6 @@ def recorded_seeds(folder: Path, suffix: str) -> list[int]:
     stems = (path.stem.removeprefix(SEED) for path in folder.glob(f"{SEED}*"))
     seeds = sorted({int(stem) for stem in stems if stem.isdecimal()})
     return [seed for seed in seeds if seed_path(folder, seed, suffix).exists()]
-
-
-def variant_name(variant: str, tag: str | None) -> str:
-    """`BC-FQI` or `BC-FQI@tag`, the name of a variant's folder."""
-    return f"{variant}@{tag}" if tag else variant
 
 
 def belongs_to(folder: Path, seed: int) -> dict[str, Any]:
@@ -84,9 +77,7 @@ def state_of(document: Mapping[str, Any]) -> str:
 
 def requested(document: Mapping[str, Any]) -> set[int]:
     """The seeds that the command which made this one was to make, this one included."""
-    return {
-        seed for first, last in document["asked"] for seed in range(first, last + 1)
-    }
+    return {n for first, last in document["asked"] for n in range(first, last + 1)}
 
 
 def ranges(seeds: Iterable[int]) -> list[list[int]]:

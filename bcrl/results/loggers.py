@@ -1,7 +1,5 @@
 """Live logging: what runs measure, sent elsewhere while they train."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -16,14 +14,15 @@ from bcrl.common.checks import construct, one_of
 from bcrl.errors import ConfigError
 from bcrl.results.layout import LOGS, seed_name
 
+Row = Mapping[str, float]
 #: Takes the name of the column that counts, and each seed's new rows.
-Log = Callable[[str, Sequence[Sequence[Mapping[str, float]]]], None]
+Log = Callable[[str, Sequence[Sequence[Row]]], None]
 
 
 class Writer(Protocol):
-    """Where one seed's rows go."""
+    """Where one seed's rows go: all again if a run resumes after an interruption."""
 
-    def write(self, count: int, row: Mapping[str, float]) -> None:
+    def write(self, count: int, row: Row) -> None:
         """A row of the seed's CSV, by its count of iterations or steps."""
 
     def close(self) -> None:
@@ -37,10 +36,7 @@ class Logger(Protocol):
     """
 
     def open(self, runs_dir: Path, run: str) -> Writer:
-        """A writer for `run`, such as "quick/maze/BC-FQI/seed_0007".
-
-        A run that resumes after an interruption writes all its rows again.
-        """
+        """A writer for `run`, such as "quick/maze/BC-FQI/seed_0007"."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +46,7 @@ class Nothing:
     def open(self, runs_dir: Path, run: str) -> Writer:
         return self
 
-    def write(self, count: int, row: Mapping[str, float]) -> None: ...
+    def write(self, count: int, row: Row) -> None: ...
 
     def close(self) -> None: ...
 
@@ -78,7 +74,7 @@ class _Events:
         self._events = SummaryWriter(folder, purge_step=0)
         self.close = self._events.close
 
-    def write(self, count: int, row: Mapping[str, float]) -> None:
+    def write(self, count: int, row: Row) -> None:
         for name, value in row.items():
             if np.isfinite(value):
                 self._events.add_scalar(name, value, count)
@@ -89,17 +85,15 @@ LOGGERS: dict[str, type] = {"none": Nothing, "tensorboard": TensorBoard}
 
 def logger(section: Any) -> Logger:
     """The logger of a config's section `logger`; ConfigError if there is none such.
-
-    Besides LOGGERS a class of the user's own may be named, as BCRL_TRUST allows.
-    """
+    Besides LOGGERS a class of the user's own may be named, as BCRL_TRUST allows."""
     if not isinstance(section, dict) or not isinstance(section.get("name"), str):
         raise ConfigError("logger", section, "must be a section with a name")
-    values = {key: value for key, value in section.items() if key != "name"}
-    name = section["name"]
-    if "." in name:
-        return construct("logger", plugins.component("logger.name", name, name), values)
-    one_of("logger.name", name, list(LOGGERS))
-    return construct("logger", LOGGERS[name], values)
+    values = dict(section)
+    name = values.pop("name")
+    if "." not in name:
+        one_of("logger.name", name, list(LOGGERS))
+    cls = LOGGERS.get(name) or plugins.component("logger.name", name, name)
+    return construct("logger", cls, values)
 
 
 @contextmanager
@@ -114,7 +108,7 @@ def opened(
         for writer in writers:
             stack.callback(writer.close)
 
-        def log(index: str, rows: Sequence[Sequence[Mapping[str, float]]]) -> None:
+        def log(index: str, rows: Sequence[Sequence[Row]]) -> None:
             for writer, added in zip(writers, rows, strict=True):
                 for row in added:
                     rest = {key: value for key, value in row.items() if key != index}

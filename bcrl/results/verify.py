@@ -1,7 +1,5 @@
 """`bcrl-verify`: whether all results in a folder are whole, unchanged and in place."""
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -13,24 +11,20 @@ from bcrl.results.arguments import ResultsParser
 from bcrl.results.integrity import check_tree
 from bcrl.results.read import BROKEN
 
-
-def parser() -> ResultsParser:
-    """The command line; its help is the reference."""
-    result = ResultsParser(
-        prog="bcrl-verify",
-        description="Check every result file of a folder: hashes, places, configs, "
-        "order, missing seeds. Exit code: 0 nothing wrong, 1 some runs are incomplete, "
-        "2 something is broken or there are no runs.",
-    )
-    result.add_argument("path", type=Path, nargs="?", help="the same as runs_dir=PATH")
-    return result
+_ABOUT = """\
+Check every result file of a folder: hashes, places, configs, order, missing seeds. Exit
+code: 0 nothing wrong, 1 some runs are incomplete, 2 something is broken or there are no
+runs.
+"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print one line per finding, then a summary; the exit code as `--help` says."""
     ready()
+    parser = ResultsParser(prog="bcrl-verify", description=_ABOUT)
+    parser.add_argument("path", type=Path, nargs="?", help="the same as runs_dir=PATH")
     try:
-        options = parser().parsed(arguments)
+        options = parser.parsed(arguments)
     except BcrlError as error:
         say(f"bcrl-verify: {error}")
         return 2
@@ -42,16 +36,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         why = "holds no runs" if runs_dir.is_dir() else "is not a folder"
         say(f"bcrl-verify: {runs_dir} {why}; name a runs_dir")
         return 2
-    complete = sum(len(variant.tables) for variant in variants)
+    done = {"variant": len(variants), "seed": sum(len(v.tables) for v in variants)}
+    shown = ", ".join(f"{n} {noun}{'s' * (n != 1)}" for noun, n in done.items())
     counts = Counter(finding.kind for finding in findings)
     wrong = ", ".join(f"{n} {kind}" for kind, n in counts.items()) or "nothing wrong"
-    done = f"{_number(len(variants), 'variant')}, {_number(complete, 'seed')} complete"
-    show(f"{done}; {wrong}")
+    show(f"{shown} complete; {wrong}")
     return 2 if counts[BROKEN] else 1 if findings else 0
-
-
-def _number(n: int, noun: str) -> str:
-    return f"{n} {noun}{'s' * (n != 1)}"
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ from bcrl.results.layout import (
     spelled,
     state_of,
 )
-from bcrl.results.read import BadFile, read_document, read_recorded
+from bcrl.results.read import Finding, read_document, read_recorded
 from bcrl.run import locks
 
 _MALFORMED = (ValueError, LookupError, TypeError, AttributeError)  # file's content
@@ -136,9 +136,9 @@ def _inspected(directory: Path, seed: int, *stamps: object) -> tuple[bool, str]:
             return False, ""
         for suffix in ("csv", "npz"):
             read_recorded(seed_path(directory, seed, suffix), document)
-    except BadFile as error:
-        what = error.finding.what.replace(f"{seed_name(seed)}.json", "the JSON")
-        return False, f"the {error.finding.path.suffix[1:].upper()} {what}"
+    except Finding as error:
+        what = error.what.replace(f"{seed_name(seed)}.json", "the JSON")
+        return False, f"the {error.path.suffix[1:].upper()} {what}"
     return True, ""
 
 

@@ -92,9 +92,6 @@ BROKEN = [
     ("seed_0001.json", {"env": "maze"}, "env 'maze', not 'car_on_hill'"),
     ("seed_0001.json", {"variant": "FQI"}, "variant 'FQI', not 'BC-FQI'"),
     ("seed_0001.json", {"tag": None}, "tag None, not 'mine'"),
-    ("seed_0001.json", {"config": []}, "entries of schema 2"),
-    ("seed_0001.json", {"status": "done"}, "entries of schema 2"),
-    ("seed_0001.json", {"sha256": {}, "status": "failed"}, "entries of schema 2"),
     ("seed_0001.json", None, "missing"),
     ("seed_0001.csv", None, "missing"),
     ("seed_0001.csv", HEADER, "SHA-256"),
@@ -143,7 +140,7 @@ TABLES = [
     (lambda t: t[:0], "has no rows"),
     (lambda t: t.drop(columns="return"), "has the header stage,task,"),
     (lambda t: t.assign(extra=1), "expected stage,task,iteration,q_error,return"),
-    (lambda t: t.assign(stage="one"), "not a number"),
+    (lambda t: t.assign(stage="one"), "CSV of numbers"),
     (lambda t: t[::-1], "iterations 1 to 4"),
     (lambda t: t.assign(stage=[1, 2, 1, 2]), "stages that fall"),
     (lambda t: t.assign(task=0), "task"),
@@ -171,11 +168,11 @@ def test_a_csv_that_is_none_is_named(folder, verified):
 
 def test_a_config_that_is_not_the_seeds_is_named_with_the_difference(folder, verified):
     for changes, what in (
-        ({"episodes": 6}, "algorithm.episodes: there 6, here 5)"),
+        ({"episodes": 6}, "algorithm.episodes: there 5, here 6)"),
         ({"episodes": 5.0}, "(types of values)"),
         (
             {"a": 1, "b": 2, "c": 3, "episodes": 5, "name": "other"},
-            "algorithm.c: there 3, here 'absent'; and 1 more)",
+            "algorithm.c: there 'absent', here 3; and 1 more)",
         ),
     ):
         edit_config(folder / "config.yaml", "algorithm", **changes)

@@ -1,14 +1,13 @@
 """Learning curves: Figures 1, 2 and 5 of the paper, and those of any environment."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import numpy as np
+import yaml
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from bcrl.common.divergence import diverging
 from bcrl.report.figures import style
@@ -19,29 +18,17 @@ POINTS = 300  # of a curve that are drawn, about
 _COLUMNS = 3  # panels beside each other
 #: What counts a family's rows, as an axis says it.
 COUNTED = {"FQI": "iteration", "DQN": "environment steps of all stages"}
-#: A metric's label on an axis (docs/reference/metrics.md); others have their names.
-_LABELS = {
-    ("FQI", "return"): "discounted return",
-    ("FQI", "q_error"): "error, mean |Q − Q*|",
-    ("FQI", "q_error_start"): "error at the start, |Q − V*|",
-    ("FQI", "residual_start"): "residual at the start",
-    ("FQI", "solved"): "episodes that end at the goal",
-    ("DQN", "return"): "return, exploring",
-    ("DQN", "discounted_return"): "discounted return, exploring",
-    ("DQN", "success_rate"): "success rate, exploring",
-    ("DQN", "greedy_return"): "return, greedy",
-    ("DQN", "greedy_discounted_return"): "discounted return, greedy",
-    ("DQN", "greedy_success_rate"): "success rate, greedy",
-    ("DQN", "q_mean"): "value at the start, max Q",
-}
+_LABELS = yaml.safe_load(Path(__file__).with_name("labels.yaml").read_text("utf-8"))
 _SEEDS = {"linewidth": 0.5, "linestyle": (0, (3, 2)), "alpha": 0.45, "zorder": 1.9}
 _TWO_ERRORS = "mean ± 2 standard errors over seeds"
-Band = tuple[NDArray[np.float64], NDArray[np.float64]]
+Band = tuple[np.ndarray, np.ndarray]
+Interval = Callable[[np.ndarray], Band]
+Rows = Callable[[Variant], np.ndarray]
 
 
 def label(family: str, metric: str) -> str:
     """A metric in words."""
-    return _LABELS.get((family, metric), metric.replace("_", " "))
+    return _LABELS[family].get(metric, metric.replace("_", " "))
 
 
 def optimum_of(methods: Methods) -> float | None:
@@ -50,18 +37,13 @@ def optimum_of(methods: Methods) -> float | None:
     return optima.pop() if len(optima) == 1 else None
 
 
-def two_errors(values: NDArray[np.float64]) -> Band:
+def two_errors(values: np.ndarray) -> Band:
     """Mean ± 2 standard errors of (S, P) values, (P,) each."""
     centre, half = values.mean(axis=0), 2 * standard_error(values)
     return centre - half, centre + half
 
 
-def every(variant: Variant) -> NDArray[np.intp]:
-    """All rows."""
-    return np.arange(len(variant.stage))
-
-
-def spread_rows(variant: Variant) -> NDArray[np.intp]:
+def spread_rows(variant: Variant) -> np.ndarray:
     """Evenly spread rows, POINTS at most, and the first and last of each stage."""
     n = len(variant.stage)
     spread = np.linspace(0, n - 1, min(n, POINTS)).round().astype(np.intp)
@@ -73,31 +55,30 @@ def draw_metric(
     axes: Axes,
     methods: Methods,
     metric: str,
-    rows: Callable[[Variant], NDArray[np.intp]] = every,
-    interval: Callable[[NDArray[np.float64]], Band] | None = two_errors,
+    rows: Rows | None = None,
+    interval: Interval | None = two_errors,
 ) -> None:
     """Every method's mean over seeds with a band, or with all seeds if no `interval`.
-
-    Diverging curves are cut off.
-    """
+    All rows are drawn unless `rows` chooses some. Diverging curves are cut off."""
     far, within = [], []
     for name, variant in methods.items():
-        if metric in variant.metrics:
-            at, line = rows(variant), style.line_of(name)
-            x, values = variant.index[at], variant.metrics[metric][:, at]
-            drawn = [values]
-            if interval:
-                low, high = interval(values)
-                fill = {"color": line["color"], "alpha": 0.25, "linewidth": 0}
-                axes.fill_between(x, low, high, **fill)
-                drawn = [values.mean(axis=0), low, high]
-            else:
-                axes.plot(x, values.T, **_SEEDS, color=line["color"])
-            width = 1.6 if interval else 2.0
-            axes.plot(x, values.mean(axis=0), linewidth=width, **line)
-            diverges = metric in diverging(variant.metrics)
-            far += [name] * diverges
-            within += [] if diverges else drawn
+        if metric not in variant.metrics:
+            continue
+        at, line = rows(variant) if rows else slice(None), style.line_of(name)
+        x, values = variant.index[at], variant.metrics[metric][:, at]
+        mean, drawn = values.mean(axis=0), [values]
+        if interval:
+            low, high = interval(values)
+            drawn = [mean, low, high]
+            fill = {"color": line["color"], "alpha": 0.25, "linewidth": 0}
+            axes.fill_between(x, low, high, **fill)
+        else:
+            axes.plot(x, values.T, **_SEEDS, color=line["color"])
+        axes.plot(x, mean, linewidth=1.6 if interval else 2.0, **line)
+        if metric in diverging(variant.metrics):
+            far.append(name)
+        else:
+            within += drawn
     style.cut(axes, far, within)
 
 
@@ -108,62 +89,54 @@ def metrics_of(methods: Methods) -> list[str]:
 
 
 def shared_spans(methods: Methods) -> list[style.Span]:
-    """The tasks' extents, if the variants with several tasks agree on them.
-
-    Others are in the last task throughout.
-    """
+    """The tasks' extents, if the variants with several tasks agree on them. Others are
+    in the last task throughout."""
     several = [v for v in methods.values() if len(np.unique(v.task)) > 1]
     spans = [style.task_spans(v) for v in several or methods.values()]
     return spans[0] if all(each == spans[0] for each in spans) else []
 
 
+def _panels(
+    methods: Methods,
+    labels: Mapping[str, str],
+    size: tuple[float, float],
+    rows: Rows | None = None,
+    interval: Interval | None = two_errors,
+) -> tuple[Figure, list[Axes]]:
+    """Panels of `labels`' metrics, _COLUMNS beside each other, tasks shaded."""
+    figure, n = Figure(figsize=size), len(labels)
+    columns, spans = min(_COLUMNS, n), shared_spans(methods)
+    grid = figure.subplots(math.ceil(n / columns), columns, squeeze=False)
+    for axes in grid.flat[n:]:
+        axes.set_axis_off()
+    family = next(variant.family for variant in methods.values())
+    for axes, (metric, ylabel) in zip(grid.flat, labels.items(), strict=False):
+        if spans:
+            style.shade_tasks(axes, spans)
+        draw_metric(axes, methods, metric, rows, interval)
+        axes.set(xlabel=COUNTED[family], ylabel=ylabel)
+        axes.margins(x=0.0)
+    return figure, list(grid.flat)
+
+
 def figure_curves(runs: Runs, env: str, family: str, tag: str | None = None) -> Figure:
     """One panel per metric: mean and 95 % interval of every method, tasks shaded."""
     methods = runs.tagged(env, family, tag)
-    metrics, spans = metrics_of(methods), shared_spans(methods)
-    columns = min(_COLUMNS, len(metrics))
-    rows = math.ceil(len(metrics) / columns)
-    size = max(0.6, columns / 2) * style.TEXT_WIDTH, 2.5 * rows + 0.7
-    figure = Figure(figsize=size)
-    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
-    for axes, metric in zip(panels, metrics, strict=False):
-        if spans:
-            style.shade_tasks(axes, spans)
-        draw_metric(axes, methods, metric, spread_rows, bootstrap_curves)
-        axes.set(xlabel=COUNTED[family], ylabel=label(family, metric))
-        axes.margins(x=0.0)
-    for axes in panels[len(metrics) :]:
-        axes.set_axis_off()
+    labels = {metric: label(family, metric) for metric in metrics_of(methods)}
+    width = max(0.6, min(_COLUMNS, len(labels)) / 2) * style.TEXT_WIDTH
+    size = width, 2.5 * math.ceil(len(labels) / _COLUMNS) + 0.7
+    figure, _ = _panels(methods, labels, size, spread_rows, bootstrap_curves)
     style.legend(figure, methods)
     what = "mean over seeds, bootstrapped 95 % interval"
     style.footer(figure, runs, methods, what)
     return figure
 
 
-def _panels(
-    methods: Methods, labels: Sequence[str], size: tuple[float, float]
-) -> tuple[Figure, list[Axes]]:
-    """Panels side by side over the iterations, tasks shaded."""
-    figure = Figure(figsize=size)
-    panels = list(figure.subplots(1, len(labels), squeeze=False)[0])
-    # Of the longest variants the one with most tasks, hence one with a curriculum.
-    longest = max(
-        methods.values(), key=lambda v: (len(v.stage), len(np.unique(v.task)))
-    )
-    spans = style.task_spans(longest)
-    for axes, ylabel in zip(panels, labels, strict=True):
-        style.shade_tasks(axes, spans)
-        axes.set(xlabel="iteration", ylabel=ylabel)
-    return figure, panels
-
-
 def figure_1(runs: Runs, tag: str | None = None) -> Figure:
     """Car on the hill: error and return, every seed and their mean (paper, Fig. 1)."""
-    methods, metrics = runs.methods("car_on_hill", tag), ("q_error", "return")
-    labels = [label("FQI", metric) for metric in metrics]
-    figure, panels = _panels(methods, labels, (style.TEXT_WIDTH, 3.3))
-    for axes, metric in zip(panels, metrics, strict=True):
-        draw_metric(axes, methods, metric, interval=None)
+    methods = runs.methods("car_on_hill", tag)
+    labels = {metric: label("FQI", metric) for metric in ("q_error", "return")}
+    figure, _ = _panels(methods, labels, (style.TEXT_WIDTH, 3.3), interval=None)
     style.legend(figure, methods)
     style.footer(figure, runs, methods, "bold: mean over seeds, dashed: single seeds")
     return figure
@@ -183,12 +156,9 @@ def figure_2(runs: Runs, tag: str | None = None) -> Figure:
         "return": "discounted return",
         "q_error": "error in the trained task\nmean |Q − Q*|",
     }
-    size = (1.4 * style.TEXT_WIDTH, 3.2)
-    figure, panels = _panels(methods, list(labels.values()), size)
-    for axes, metric in zip(panels, labels, strict=True):
-        draw_metric(axes, methods, metric)
-        if metric != "return":
-            axes.set_ylim(bottom=0)
+    figure, panels = _panels(methods, labels, (1.4 * style.TEXT_WIDTH, 3.2))
+    for axes in (panels[0], panels[2]):
+        axes.set_ylim(bottom=0)
     optimum = optimum_of(methods)
     if optimum is not None:
         panels[1].axhline(optimum, **style.OPTIMUM)
@@ -200,10 +170,9 @@ def figure_2(runs: Runs, tag: str | None = None) -> Figure:
 def figure_5(runs: Runs, tag: str | None = None) -> Figure:
     """Maze: BC-FQI's residual at s0, averaged over actions (paper, Fig. 5)."""
     methods = {"BC-FQI": runs.methods("maze", tag)["BC-FQI"]}
-    ylabel = "residual at the start\n" + r"mean$_a$ ϱ$_t$(s$_0$, a)"
-    figure, (axes,) = _panels(methods, [ylabel], (0.75 * style.TEXT_WIDTH, 3.0))
-    axes.axhline(0.0, color="0.6", linewidth=0.6)
-    draw_metric(axes, methods, "residual_start")
+    labels = {"residual_start": "residual at the start\n" r"mean$_a$ ϱ$_t$(s$_0$, a)"}
+    figure, (axes,) = _panels(methods, labels, (0.75 * style.TEXT_WIDTH, 3.0))
+    axes.axhline(0.0, color="0.6", linewidth=0.6, zorder=1.9)
     style.legend(figure, methods)
     style.footer(figure, runs, methods, _TWO_ERRORS, compares=False)
     return figure

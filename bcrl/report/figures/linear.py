@@ -1,54 +1,63 @@
 """Figure 4 of the paper: the linear system's learning curves, priors and target."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
-from numpy.typing import NDArray
 
 from bcrl.report.figures import style
 from bcrl.report.figures.curves import draw_metric
-from bcrl.report.late import (
-    LEARNER_NAMES,
-    LINEAR,
-    pretraining,
-    pretraining_rows,
-    switches,
-    target_rows,
-)
-from bcrl.report.variants import Methods, Runs, Variant
-from bcrl.results.read import bad_file
+from bcrl.report.variants import LINEAR, Methods, Runs, Variant
 
-_WORST = -150.0  # target return of a policy that never succeeds: −1 in 150 steps
+#: A learner's name in the records → in the figures; whose colour it has.
+_LEARNERS = {"lspi": "LSPI", "dqn": "DQN on LQ"}
+_SOURCES = {"lspi": "LSPI", "dqn": "C-DQN"}
 _SHOWN_SEED = {"lspi": 0, "dqn": 10}  # whose Q the paper's Figure 4b shows
-_SOURCES = {"lspi": "LSPI", "dqn": "C-DQN"}  # learner → whose colour it has
+_WORST = -150.0  # target return of a policy that never succeeds: −1 in 150 steps
 _APART = 0.18  # share of the axis below which neighbouring labels take two rows
 _EVERY = 4  # grid points per arrow
-_SMALL = {"fontsize": 6.5, "color": "0.35", "textcoords": "offset points"}
+_SMALL = style.SMALL | {"fontsize": 6.5}
 NO_RUNS = {"ha": "center", "va": "center", "color": "0.5"}
+
+
+def _pretraining_rows(variant: Variant) -> np.ndarray:
+    """Rows of a first stage on another task than the target; may be none, (P,)."""
+    return np.flatnonzero((variant.stage == 1) & (variant.task != variant.task[-1]))
+
+
+def pretraining(methods: Methods) -> dict[str, Variant]:
+    """A variant that shows each learner's pretraining: the one with most seeds. Methods
+    that pretrain with the same learner share that stage, draw by draw."""
+    found: dict[str, Variant] = {}
+    for variant in sorted(methods.values(), key=lambda v: -len(v.seeds)):
+        if len(_pretraining_rows(variant)):
+            found.setdefault(variant.sidecars[0]["learners"][0], variant)
+    return {learner: found[learner] for learner in _LEARNERS if learner in found}
 
 
 def _draw_target(axes: Axes, methods: Methods) -> None:
     axes.axhline(_WORST, color="0.6", linewidth=0.6)
     place = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "top"}
     axes.annotate("never succeeding", (1.0, _WORST), (0, -2), **place, **_SMALL)
-    draw_metric(axes, methods, "return", target_rows)
+    draw_metric(axes, methods, "return", lambda variant: variant.target_rows)
     end = max(int(variant.index[-1]) for variant in methods.values())
     axes.set_xlim(0, 1.03 * end)
     bottom, top = axes.get_ylim()
     axes.set_ylim(bottom=min(bottom, _WORST - 0.07 * (top - _WORST)))  # room for a word
+    switches = {
+        (int(v.index[rows[-1]]), v.sidecars[0]["learners"][0])
+        for v in methods.values()
+        if len(rows := _pretraining_rows(v))
+    }
     previous = -np.inf
     place = {"xycoords": ("data", "axes fraction"), "ha": "left", "va": "bottom"}
-    for (learner, step), label in sorted(
-        switches(methods).items(), key=lambda item: item[0][1]
-    ):
+    for step, learner in sorted(switches):
         colour = style.colour(_SOURCES[learner]) if learner in _SOURCES else "0.5"
         axes.axvline(step, color=colour, linestyle=":")
         raised = 10 if step - previous < _APART * end else 2
-        axes.annotate(label, (step, 1.0), (0, raised), **place, **_SMALL)
+        text = f"{_LEARNERS.get(learner, learner)} → target"
+        axes.annotate(text, (step, 1.0), (0, raised), **place, **_SMALL)
         previous = step
     axes.set_ylabel("return in the target task (undiscounted)")
 
@@ -57,9 +66,8 @@ def _draw_pretraining(axes: Axes, methods: Methods) -> None:
     handles = []
     for learner, variant in pretraining(methods).items():
         source, n = _SOURCES[learner], len(variant.seeds)
-        shown = {source: variant}
-        draw_metric(axes, shown, "discounted_return", pretraining_rows)
-        label = f"{LEARNER_NAMES[learner]}, {n} seed{'s' * (n != 1)}"
+        draw_metric(axes, {source: variant}, "discounted_return", _pretraining_rows)
+        label = f"{_LEARNERS[learner]}, {n} seed{'s' * (n != 1)}"
         line = {"color": style.colour(source), "linewidth": 2, "label": label}
         handles.append(Line2D([], [], **line))
     if handles:
@@ -90,35 +98,17 @@ def figure_4a(runs: Runs, tag: str | None = None) -> Figure:
     return figure
 
 
-def prior(variant: Variant, seed: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """The first stage's Q of a seed on the x–y plane at zero velocity.
-
-    Axes x (X,), y (Y,), value max_a Q (X, Y) and the greedy action's force (X, Y, 2).
-    Raises BcrlError if the states are no whole x-major grid or the shapes disagree.
-    """
+def prior(variant: Variant, seed: int) -> tuple[np.ndarray, ...]:
+    """The first stage's Q of a seed on the x–y plane at zero velocity. Axes x (X,), y
+    (Y,), value max_a Q (X, Y) and the greedy action's force (X, Y, 2)."""
     states, q, actions = variant.arrays(seed, "states", "q_stages", "actions")
-    if q.ndim != 3 or q.shape[1:] != (len(states), len(actions)) or not len(q):
-        raise bad_file(variant.npz(seed), f"has a q_stages of shape {q.shape}")
-    x, y = axes_of_grid(variant, seed, states[:, [0, 2]])  # state order x, ẋ, y, ẏ
+    x, y = np.unique(states[:, 0]), np.unique(states[:, 2])  # x, ẋ, y, ẏ; x-major
     force = actions[q[0].argmax(axis=1)]
     return x, y, q[0].max(axis=1).reshape(len(x), -1), force.reshape(len(x), -1, 2)
 
 
-def axes_of_grid(
-    variant: Variant, seed: int, points: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """x (X,) and y (Y,) of points (X · Y, 2); BcrlError unless the grid is x-major."""
-    x, y = np.unique(points[:, 0]), np.unique(points[:, 1])
-    grid = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
-    if grid.shape != points.shape or not np.allclose(grid, points):
-        raise bad_file(variant.npz(seed), "has states that are no grid")
-    return x, y
-
-
 def _draw_prior(axes: Axes, learner: str, variant: Variant | None) -> None:
-    axes.set(xlabel="position x", ylabel="position y", aspect="equal")
-    name = LEARNER_NAMES[learner].removesuffix(" on LQ")
-    title = rf"{name}: max$_a$ Q in the LQ task"
+    title = rf"{learner.upper()}: max$_a$ Q in the LQ task"
     if variant is None:
         axes.set_title(title, pad=4)
         axes.set(xlim=(-5, 5), ylim=(-5, 5))
@@ -129,7 +119,7 @@ def _draw_prior(axes: Axes, learner: str, variant: Variant | None) -> None:
     x, y, value, force = prior(variant, seed)
     image = axes.pcolormesh(x, y, value.T, cmap="viridis", rasterized=True)
     at = slice(None, None, _EVERY)
-    fx, fy = force[at, at, 0].T, force[at, at, 1].T
+    fx, fy = force[at, at].T
     look = {"color": "white", "edgecolor": "black", "linewidth": 0.4}
     axes.quiver(x[at], y[at], fx, fy, pivot="middle", scale=16, width=0.009, **look)
     axes.set_title(f"{title}, seed {seed}", pad=4)
@@ -138,14 +128,9 @@ def _draw_prior(axes: Axes, learner: str, variant: Variant | None) -> None:
 
 def _draw_environment(axes: Axes, variant: Variant) -> None:
     """The target: strip, walls, goal, start region and drift."""
-    seed, names = min(variant.seeds), ("pathway", "goal", "start", "drift")
-    pathway, goal, start, drift = arrays = variant.arrays(seed, *names)
-    shapes = [np.shape(array) for array in arrays]
-    if shapes != [(4,), (3,), (4,), (2,)]:
-        raise bad_file(variant.npz(seed), f"describes its target in shapes {shapes}")
-    x0, y0, x1, y1 = pathway
+    names = ("pathway", "goal", "start", "drift")
+    (x0, y0, x1, y1), goal, start, drift = variant.arrays(min(variant.seeds), *names)
     length, margin = x1 - x0, 0.08 * (x1 - x0)
-    axes.set(xlabel="position x", ylabel="position y", aspect="equal")
     axes.set(xlim=(x0 - margin, x1 + margin), ylim=(y0 - length / 3, y1 + length / 3))
     axes.set_title("target task", pad=4)
     axes.set_facecolor("0.88")
@@ -155,22 +140,23 @@ def _draw_environment(axes: Axes, variant: Variant) -> None:
     axes.vlines([x0, x1], *axes.get_ylim(), color="black", linewidth=2.2)
     place = {"facecolor": style.colour("B"), "edgecolor": "black"}
     axes.add_patch(Circle(goal[:2], goal[2], **place))
-    region = {"facecolor": style.colour("SC"), "edgecolor": style.colour("DQN")}
+    place = {"facecolor": style.colour("SC"), "edgecolor": style.colour("DQN")}
     size = start[2:] - start[:2]
-    axes.add_patch(Rectangle(start[:2], *size, linewidth=2, zorder=3, **region))
-    small = {"fontsize": 6.5, "xycoords": "data", "textcoords": "offset points"}
-    above = small | {"va": "bottom", "ha": "center"}
-    below = small | {"va": "top"}
+    axes.add_patch(Rectangle(start[:2], *size, linewidth=2, zorder=3, **place))
     middle, speed, top = (x0 + x1) / 2, float(np.hypot(*drift)), axes.get_ylim()[1]
+    names = [("goal", goal[0]), ("start", (start[0] + start[2]) / 2)]
     if speed > 0:
         axes.quiver(middle, (y0 + y1) / 2, *(drift / speed), scale=6, width=0.012)
-        axes.annotate(f"drift {speed:g}", (middle, y1), (0, 2), **above)
-    axes.annotate("goal", (goal[0], y1), (0, 2), **above)
-    axes.annotate("start", ((start[0] + start[2]) / 2, y1), (0, 2), **above)
-    off = "off the pathway: back to the start"
-    axes.annotate(off, (middle, y0), (0, -6), ha="center", **below)
-    for x, where, shift in ((x0, "left", 4), (x1, "right", -4)):
-        axes.annotate("wall, reflecting", (x, top), (shift, -3), ha=where, **below)
+        names.append((f"drift {speed:g}", middle))
+    small = {"fontsize": 6.5, "xycoords": "data", "textcoords": "offset points"}
+    for name, x in names:
+        axes.annotate(name, (x, y1), (0, 2), ha="center", va="bottom", **small)
+    for text, at, shift, side in (
+        ("off the pathway: back to the start", (middle, y0), (0, -6), "center"),
+        ("wall, reflecting", (x0, top), (4, -3), "left"),
+        ("wall, reflecting", (x1, top), (-4, -3), "right"),
+    ):
+        axes.annotate(text, at, shift, ha=side, va="top", **small)
 
 
 def figure_4b(runs: Runs, tag: str | None = None) -> Figure:
@@ -183,7 +169,9 @@ def figure_4b(runs: Runs, tag: str | None = None) -> Figure:
     found = pretraining(methods)
     figure = Figure(figsize=(1.45 * style.TEXT_WIDTH, 3.8))  # widths decide
     panels = figure.subplots(1, 3, width_ratios=(1.15, 1.15, 1))
-    for axes, learner in zip(panels, LEARNER_NAMES, strict=False):
+    for axes in panels:
+        axes.set(xlabel="position x", ylabel="position y", aspect="equal")
+    for axes, learner in zip(panels, _LEARNERS, strict=False):
         _draw_prior(axes, learner, found.get(learner))
     variant = next(iter(methods.values()))
     _draw_environment(panels[2], variant)

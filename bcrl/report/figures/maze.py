@@ -1,27 +1,22 @@
 """Figure 3 of the paper: the mazes, the learned values, the greedy trajectories."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
 from bcrl.report.figures import style
-from bcrl.report.figures.linear import NO_RUNS, axes_of_grid
+from bcrl.report.figures.linear import NO_RUNS
 from bcrl.report.variants import METHODS, Methods, Runs, Variant
-from bcrl.results.read import bad_file
 
-_SIZE = (11.4, 4.2)  # inches
 _MARGIN = 0.025  # half a lattice cell
 _SPREAD = 0.012  # how far apart the seeds' trajectories are drawn, in maze lengths
 _SHOWN_MAZES = 4
 
 
-def _draw_walls(axes: Axes, walls: NDArray[np.float64], filled: bool = True) -> None:
+def _draw_walls(axes: Axes, walls: np.ndarray, filled: bool = True) -> None:
     """Rectangles (walls, 4) as x0, y0, x1, y1: filled, or outlined over an image."""
     look = {"facecolor": "0.55", "edgecolor": "0.35", "linewidth": 0.5}
     if not filled:
@@ -30,7 +25,7 @@ def _draw_walls(axes: Axes, walls: NDArray[np.float64], filled: bool = True) -> 
         axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, zorder=2, **look))
 
 
-def _draw_ends(axes: Axes, goal: NDArray, start: NDArray) -> None:
+def _draw_ends(axes: Axes, goal: np.ndarray, start: np.ndarray) -> None:
     """A circle where episodes start, a star at the goal."""
     marks = {"linestyle": "none", "markeredgewidth": 0.7, "zorder": 5}
     marks |= {"markerfacecolor": "white", "markeredgecolor": "black", "clip_on": False}
@@ -46,55 +41,25 @@ def _frame(axes: Axes, title: str) -> None:
     axes.spines[:].set_visible(True)
 
 
-def seed_mean_value(variant: Variant) -> tuple[NDArray, NDArray, NDArray]:
-    """Lattice axes x (X,), y (Y,) and max_a of the seed-mean Q there, (X, Y).
-
-    Raises BcrlError if a seed's states are not one whole x-major lattice.
-    """
-    found = []
-    for seed in variant.seeds:
-        states, q = variant.arrays(seed, "states", "q")
-        x, y = axes_of_grid(variant, seed, states)
-        if len(q) != len(states) or q.shape != (found or [q])[0].shape:
-            raise bad_file(variant.npz(seed), f"has a q of shape {q.shape}")
-        found.append(q)
-    value = (sum(found) / len(found)).max(axis=1)
+def seed_mean_value(variant: Variant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Axes x (X,), y (Y,) of the x-major lattice, max_a of the seed-mean Q (X, Y)."""
+    loaded = [variant.arrays(seed, "states", "q") for seed in variant.seeds]
+    x, y = (np.unique(column) for column in loaded[0][0].T)
+    value = np.mean([q for _, q in loaded], axis=0).max(axis=1)
     return x, y, value.reshape(len(x), len(y))
 
 
-def trajectories(variant: Variant) -> list[NDArray[np.float64]]:
-    """Every seed's greedy episode, (L, 2) each; lengths differ."""
-    found = []
-    for seed in variant.seeds:
-        (path,) = variant.arrays(seed, "trajectory")
-        if path.ndim != 2 or path.shape[1] != 2 or not len(path):
-            what = f"has a trajectory of shape {path.shape}, expected (L, 2)"
-            raise bad_file(variant.npz(seed), what)
-        found.append(path)
-    return found
-
-
-def _draw_value(axes: Axes, name: str, variant: Variant, walls: NDArray) -> None:
-    x, y, value = seed_mean_value(variant)
-    image = axes.pcolormesh(x, y, value.T, cmap="viridis", rasterized=True)
-    _draw_walls(axes, walls, filled=False)
-    _frame(axes, name)
-    style.colour_bar(axes, image, shrink=0.9, aspect=14).ax.locator_params(nbins=5)
-
-
-def _draw_paths(
-    axes: Axes, name: str, variant: Variant, walls: NDArray, goal: NDArray
-) -> None:
-    _draw_walls(axes, walls)
-    paths = trajectories(variant)
+def _draw_paths(axes: Axes, name: str, variant: Variant, goal: np.ndarray) -> None:
+    """Every seed's greedy episode; their lengths differ."""
     # Lattice paths coincide: drawn side by side, one can see how many there are.
-    shifts = np.linspace(-_SPREAD, _SPREAD, len(paths)) if len(paths) > 1 else [0.0]
+    n = len(variant.seeds)
+    shifts = np.linspace(-_SPREAD, _SPREAD, n) if n > 1 else [0.0]
     look = {"color": style.colour(name), "linewidth": 0.7, "alpha": 0.6, "zorder": 3}
-    for path, shift in zip(paths, shifts, strict=True):
+    for seed, shift in zip(variant.seeds, shifts, strict=True):
+        (path,) = variant.arrays(seed, "trajectory")  # (L, 2)
         axes.plot(path[:, 0] + shift, path[:, 1] - shift, **look)
-    _draw_ends(axes, goal, paths[0][0])
-    solved = int(variant.last("solved").sum())
-    _frame(axes, f"{name}: {solved} of {len(paths)} arrive")
+    _draw_ends(axes, goal, path[0])
+    _frame(axes, f"{name}: {int(variant.last('solved').sum())} of {n} arrive")
 
 
 def _grid(panel: SubFigure, methods: Methods) -> Iterator[tuple[Axes, str, Variant]]:
@@ -117,7 +82,7 @@ def figure_3(runs: Runs, tag: str | None = None) -> Figure:
     reference = max(methods.values(), key=lambda v: len(np.unique(v.task)))
     names = ("walls", "goal", "trajectory")
     walls, goal, path = reference.arrays(reference.seeds[0], *names)
-    figure = Figure(figsize=_SIZE)
+    figure = Figure(figsize=(11.4, 4.2))
     figure.get_layout_engine().set(w_pad=0.07)
     target = f"T{len(walls)}"
     titles = (
@@ -134,9 +99,14 @@ def figure_3(runs: Runs, tag: str | None = None) -> Figure:
         _draw_ends(axes, goal, path[0])
         _frame(axes, f"T{task + 1}")
     for axes, name, variant in _grid(panels[1], methods):
-        _draw_value(axes, name, variant, walls[-1])
+        x, y, value = seed_mean_value(variant)
+        image = axes.pcolormesh(x, y, value.T, cmap="viridis", rasterized=True)
+        _draw_walls(axes, walls[-1], filled=False)
+        _frame(axes, name)
+        style.colour_bar(axes, image, shrink=0.9, aspect=14).ax.locator_params(nbins=5)
     for axes, name, variant in _grid(panels[2], methods):
-        _draw_paths(axes, name, variant, walls[-1], goal)
+        _draw_walls(axes, walls[-1])
+        _draw_paths(axes, name, variant, goal)
     what = "circle: start, star: goal; in (c) seeds are drawn side by side"
     style.footer(figure, runs, methods, what)
     return figure

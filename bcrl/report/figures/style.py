@@ -1,7 +1,5 @@
 """The look that all figures share: colours, type, task bands, legend, saving."""
 
-from __future__ import annotations
-
 import itertools
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -10,13 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import matplotlib
+import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
 from bcrl import __version__
 from bcrl.common.files import write_atomically
@@ -38,37 +35,20 @@ COLOURS = {
 }
 _BANDS = ("#EBEBEB", "#F8F8F8")
 OPTIMUM = {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 1.0}
+SMALL = {"color": "0.35", "textcoords": "offset points"}  # labels beside what they name
 
 _DPI = 150
 TEXT_WIDTH = 7.2  # inches, a full text width
 _NARROW = 0.055  # share of an axis below which neighbouring labels take two rows
 _FOOTER_WIDTH = 20  # characters of small print per inch
 
-_RC = {
-    "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine
-    "font.size": 8.0,
-    "axes.labelsize": 8.5,
-    "axes.titlesize": 8.5,
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.axisbelow": True,
-    "xtick.labelsize": 7.5,
-    "ytick.labelsize": 7.5,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "lines.solid_capstyle": "round",
-    "figure.constrained_layout.use": True,
-    "pdf.fonttype": 42,  # TrueType: text stays text
-}
-
 Span = tuple[str, float, float]  # a task's name, where it begins and ends
 
 
 def sheet() -> AbstractContextManager[None]:
     """The style, to be in force while a figure is drawn and while it is saved."""
-    defaults = {k: v for k, v in matplotlib.rcParamsDefault.items() if k != "backend"}
-    return matplotlib.rc_context({**defaults, **_RC})
+    ours = Path(__file__).with_name("bcrl.mplstyle")
+    return matplotlib.style.context(["default", ours])
 
 
 def colour(method: str) -> str:
@@ -91,17 +71,14 @@ def line_of(method: str) -> dict[str, Any]:
 
 def task_spans(variant: Variant) -> list[Span]:
     """Name and extent, on the axis of iterations or steps, of every task of a variant.
-
-    An iteration reaches half a one to either side; steps continue across tasks.
-    """
-    starts = [0, *(np.flatnonzero(np.diff(variant.task)) + 1), len(variant.task)]
-    edges = np.arange(len(variant.task) + 1) + 0.5
+    An iteration reaches half a one to either side; steps continue across tasks."""
+    task, steps = variant.task, variant.index
+    ends = np.flatnonzero(np.diff(task)) + 1
+    starts = itertools.pairwise([0, *ends, len(task)])
+    edges = np.arange(len(task) + 1) + 0.5
     if variant.family == "DQN":
-        edges = np.append(variant.index, variant.index[-1])
-    return [
-        (f"T{variant.task[start]}", float(edges[start]), float(edges[end]))
-        for start, end in itertools.pairwise(starts)
-    ]
+        edges = np.append(steps, steps[-1]).astype(float)
+    return [(f"T{task[a]}", edges[a].item(), edges[b].item()) for a, b in starts]
 
 
 def shade_tasks(axes: Axes, spans: Sequence[Span]) -> None:
@@ -109,23 +86,20 @@ def shade_tasks(axes: Axes, spans: Sequence[Span]) -> None:
     first, last = spans[0][1], spans[-1][2]
     axes.set_xlim(first, last)
     axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True, steps=[1, 2, 5, 10]))
+    place = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom"}
     row, previous_narrow = 0, False
     for number, (label, start, end) in enumerate(spans):
         axes.axvspan(start, end, color=_BANDS[number % 2], linewidth=0, zorder=0)
         narrow = (end - start) / (last - first) < _NARROW
         row = 1 - row if narrow and previous_narrow else 0
         previous_narrow = narrow
-        small = {"ha": "center", "va": "bottom", "fontsize": 7, "color": "0.35"}
-        above = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
         middle, shift = ((start + end) / 2, 1.0), (0, 2 + 8 * row)
-        axes.annotate(label, middle, shift, **above, **small)
+        axes.annotate(label, middle, shift, **place, fontsize=7, **SMALL)
 
 
-def cut(axes: Axes, names: Sequence[str], within: Sequence[NDArray]) -> None:
-    """Let the y-axis show what is `within`, and name the curves that leave it.
-
-    For curves `names` that diverge: they would flatten all others.
-    """
+def cut(axes: Axes, names: Sequence[str], within: Sequence[np.ndarray]) -> None:
+    """Let the y-axis show what is `within`, and name the curves that leave it. For
+    curves `names` that diverge: they would flatten all others."""
     shown = np.concatenate([np.ravel(values) for values in within] or [[]])
     shown = shown[np.isfinite(shown)]
     if not names or not len(shown):
@@ -143,31 +117,23 @@ def legend(figure: Figure, methods: Iterable[str], optimum: bool = False) -> Non
     lines = [{"label": name, "linewidth": 2, **line_of(name)} for name in methods]
     if optimum:
         lines.append({"label": "optimum of the target", **OPTIMUM})
-    figure.legend(
-        handles=[Line2D([], [], **line) for line in lines],
-        loc="outside upper center",
-        ncols=len(lines),
-        handlelength=1.8,
-    )
+    handles = [Line2D([], [], **line) for line in lines]
+    place = {"loc": "outside upper center", "ncols": len(lines)}
+    figure.legend(handles=handles, handlelength=1.8, **place)
 
 
 def footer(
     figure: Figure, runs: Runs, methods: Methods, what: str, compares: bool = True
 ) -> None:
     """Small print: environment, scale, number of seeds, `what` is drawn, what is odd.
-
-    `compares`: differences between methods belong to it.
-    """
+    `compares`: differences between methods belong to it."""
     env = next(v.env for v in methods.values())
-    counts = {name: len(v.seeds) for name, v in methods.items()}
-    if len(set(counts.values())) == 1:
-        n = next(iter(counts.values()))
-        seeds = f"{n} seed{'s' * (n != 1)}{' per method' * (len(counts) > 1)}"
-    else:
-        seeds = "seeds " + ", ".join(f"{name} {n}" for name, n in counts.items())
+    counts = [len(v.seeds) for v in methods.values()]
+    n = "–".join(map(str, sorted({min(counts), max(counts)})))
+    seeds = f"{n} seed{'s' * (n != '1')}{' per method' * (len(counts) > 1)}"
     parts = [env_title(env), f"scale {runs.scale}", seeds, tags_shown(methods), what]
     lines = [" · ".join(filter(None, parts))]
-    lines += remarks(runs.notes, methods, compares)
+    lines += remarks(runs, methods, compares)
     limit = int(figure.get_figwidth() * _FOOTER_WIDTH)
     text = "\n".join(part for line in lines for part in textwrap.wrap(line, limit))
     figure.supxlabel(text, x=0.01, ha="left", fontsize=6.5, color="0.35")
@@ -187,7 +153,6 @@ def save_figure(figure: Figure, folder: Path, name: str, title: str) -> list[Pat
     pdf = {"Title": title, "Creator": software, "CreationDate": None}
     files = []
     for kind, about in (("png", {"Title": title, "Software": software}), ("pdf", pdf)):
-        options = {"format": kind, "dpi": _DPI, "metadata": about}
-        write = partial(figure.savefig, **options)
+        write = partial(figure.savefig, format=kind, dpi=_DPI, metadata=about)
         files.append(write_atomically(folder / f"{name}.{kind}", write))
     return files

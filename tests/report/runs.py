@@ -1,0 +1,203 @@
+"""Made-up runs of the paper's environments whose right answers are known beforehand."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from bcrl.report import cli
+from bcrl.report.variants import COMPARED, METHODS
+from bcrl.results.layout import DQN_METRICS, seed_path
+from tests.results.made_up import made_up_plan, write_seeds
+
+#: Iterations of each stage: the paper's, and few.
+LENGTHS = {"maze": (10, 10, 10, 10, 20, 20, 50, 50, 50, 50)}
+SHORT = {"car_on_hill": (3, 3, 3), "maze": (2,) * 10}
+OPTIMUM = -47.557563488
+LATTICE = np.array([(x, y) for x in range(21) for y in range(21)]) / 20
+
+SEVEN = COMPARED["linear_system", "DQN"]
+LEVEL = {"DQN": -100, "C-DQN": -120, "BC-DQN": -80, "SC-DQN": -60, "SBC-DQN": -45}
+LEVEL |= {"RPL": -110, "PPR": -105, "S-DQN": -100}
+ACTIONS = np.array(
+    [(1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)], float
+)
+ACTIONS /= np.linalg.norm(ACTIONS, axis=1, keepdims=True)
+PLANE = np.array([(x, 0, y, 0) for x in range(-20, 21) for y in range(-20, 21)]) / 4
+
+
+def report(runs_dir: Path, *arguments: str) -> int:
+    """`bcrl-report` of the smoke runs in a folder: its exit code."""
+    return cli.main(["--runs-dir", str(runs_dir), "--scale", "smoke", *arguments])
+
+
+def verdicts_of(document: str, section: str) -> dict[str, str]:
+    """Claim → verdict, read back from the Markdown table of a section."""
+    part = document.split(f"## {section}")[1].split("\n\n")[2]
+    lines = [line.strip("| ") for line in part.splitlines() if line.startswith("| ")]
+    rows = [re.split(r" (?<!\\)\| ", line) for line in lines[2:]]
+    return {cells[0]: cells[-1] for cells in rows}
+
+
+# --- car on the hill and maze
+
+
+def as_the_paper_says(env, method, seed, stage):
+    """Curves with which every claim is true, with a little spread between seeds."""
+    jitter = 0.001 * seed
+    first = np.concatenate([[True], np.diff(stage) > 0])
+    ones = np.ones(len(stage))
+    if env == "car_on_hill":
+        error = {"FQI": 0.5, "C-FQI": 0.3, "B-FQI": 0.45, "BC-FQI": 0.1}[method] * ones
+        last = np.concatenate([first[1:], [True]])
+        if method == "C-FQI":
+            error = error + 0.1 * (stage > 1) + 0.05 * (last & (stage == 3))
+        if method == "BC-FQI":
+            error = error - 0.02 * (stage == 2) + 0.04 * (first & (stage == 3))
+        return {"q_error": error + jitter, "return": 1 - error + jitter}
+    solves = method == "BC-FQI" or (method == "C-FQI" and seed == 0)
+    residual = np.array([9, 7, 5, 4, 3, 2, 6, 4, 3, 1])[stage - 1]
+    reached = OPTIMUM if solves else (-65 if method == "C-FQI" else -90) - 2 * seed
+    error = {"FQI": 30, "C-FQI": 10, "B-FQI": 25, "BC-FQI": 1}[method] + jitter
+    return {
+        "return": reached - 0.5 * np.arange(len(stage))[::-1],  # rising to its end
+        "q_error_start": error * ones,
+        "q_error": error * ones,
+        "residual_start": -residual - jitter,
+        "solved": int(solves) * ones,
+    }
+
+
+def the_opposite(env, method, seed, stage):
+    """The same with BC-FQI's and FQI's curves exchanged, and C-FQI's and B-FQI's."""
+    other = dict(zip(METHODS, METHODS[::-1], strict=True))
+    curves = as_the_paper_says(env, other[method], seed, stage)
+    if env == "maze":
+        curves["residual_start"] = curves["residual_start"][::-1]
+    return curves
+
+
+def maze_arrays(seed: int) -> dict[str, np.ndarray]:
+    path = np.linspace(0, 0.95, 20 + seed % 8)[:, None] * [1, 1]
+    h = np.linspace(0.05, 0.95, 10)
+    ones, zeros = np.ones(10), np.zeros(10)
+    low = np.stack([0.15 * ones, zeros, 0.25 * ones, h], -1)
+    high = np.stack([0.55 * ones, 1 - h, 0.65 * ones, ones], -1)
+    values = LATTICE.sum(1) * 20 - 60 + seed
+    return {
+        "states": LATTICE,
+        "q": values[:, None] - np.arange(4),
+        "trajectory": path,
+        "walls": np.stack([low, high], 1),
+        "goal": np.array([0.95, 0.95]),
+    }
+
+
+def write_fqi(
+    runs_dir: Path,
+    env: str,
+    scale: str = "smoke",
+    seeds: int = 6,
+    methods: tuple[str, ...] = METHODS,
+    lengths: dict = SHORT,
+    tag: str = "",
+    curves=as_the_paper_says,
+) -> None:
+    """Complete runs as the runner leaves them."""
+    stage = np.repeat(np.arange(1, len(lengths[env]) + 1), lengths[env])
+    facts = {"optimum": OPTIMUM if env == "maze" else None}
+    facts |= {"cpu_seconds": 3.6, "wall_seconds": 4.0}
+    for method in methods:
+        taught = method.startswith(("C-", "BC-"))
+        task = stage if taught else np.full(len(stage), stage[-1])
+        index = {"stage": stage, "task": task}
+        index |= {"iteration": np.arange(1, len(stage) + 1)}
+
+        def table(seed: int, method=method, index=index) -> pd.DataFrame:
+            return pd.DataFrame(index | curves(env, method, seed, stage))
+
+        plan = made_up_plan(runs_dir, env, method + tag, range(seeds), scale)
+        write_seeds(plan, table, maze_arrays if env == "maze" else lambda s: {}, facts)
+
+
+# --- linear system
+
+
+def steps_of(method: str) -> list[tuple[int, int, list[int]]]:
+    """(stage, task, steps of its evaluations), as the paper's budgets give."""
+    if method in ("DQN", "S-DQN"):
+        return [(1, 2, [500 + 1000 * k - 500 * (k > 0) for k in range(41)])]
+    if method == "C-DQN":
+        lq = [500 * k for k in range(1, 22)]
+        return [(1, 1, lq), (2, 2, [10500 + 1000 * k for k in range(31)])]
+    fill = 500 if method == "SC-DQN" else 0
+    lspi = (1, 1, [0, 500, 1000, 1500, 2000])
+    return [lspi, (2, 2, [2000 + fill + 1000 * k for k in range(39)])]
+
+
+def dqn_table(method: str, seed: int, scatter: float = 5.0) -> pd.DataFrame:
+    """A learning curve from −150 up to LEVEL, with some noise."""
+    rng = np.random.default_rng([seed, SEVEN.index(method) if method in SEVEN else 9])
+    blocks = []
+    for stage, task, steps in steps_of(method):
+        t = (np.array(steps) - steps[0]) / 40000
+        if task == 2:
+            gain = (LEVEL[method] + 150) * (1 - np.exp(-t * 5))
+            value = -150 + gain + rng.normal(0, scatter) * (t > 0)
+            value = np.clip(value + rng.normal(0, scatter, len(t)), -150, 0)
+        else:
+            value = -150 - 2500 * np.exp(-t * 40) + rng.normal(0, 20, len(t))
+        loss = np.full(len(t), 0.5 if task == 2 or method == "C-DQN" else np.nan)
+        loss[0] = np.nan
+        block = dict.fromkeys(DQN_METRICS, value) | {"loss": loss}
+        block |= {"discounted_return": 0.6 * value, "greedy_return": value + 1}
+        block |= {"success_rate": 1 + value / 150 if task == 2 else 0.0}
+        index = {"stage": stage, "task": task, "step": steps}
+        blocks.append(pd.DataFrame(index | block))
+    return pd.concat(blocks, ignore_index=True)
+
+
+def dqn_arrays(method: str) -> dict[str, np.ndarray]:
+    x, y = PLANE[:, 0], PLANE[:, 2]
+    value = -30 * (x**2 + y**2) - 100
+    pull = -np.stack([x, y], 1) @ ACTIONS.T  # towards the origin
+    stages = len(steps_of(method))
+    return {
+        "states": PLANE,
+        "q_stages": np.repeat((value[:, None] + pull)[None], stages, 0),
+        "actions": ACTIONS,
+        "pathway": np.array([-5, -0.5, 1, 0.5]),
+        "goal": np.array([0, 0, 0.2]),
+        "start": np.array([-4.001, -0.4, -3.999, 0.4]),
+        "drift": np.array([-0.5, 0.0]),
+    }
+
+
+def write_dqn(
+    runs_dir: Path,
+    methods: tuple[str, ...] = SEVEN,
+    seeds: range = range(6),
+    tag: str = "",
+    env: str = "linear_system",
+    config: dict | None = None,
+    shift: float = 0.0,
+    scatter: float = 5.0,
+) -> None:
+    """Complete runs as the runner leaves them."""
+    for method in methods:
+        first = "dqn" if method in ("DQN", "C-DQN", "S-DQN") else "lspi"
+        facts = {"learners": [first, "dqn"][: len(steps_of(method))]}
+        facts |= {"optimum": None, "cpu_seconds": 60.0}
+
+        def table(seed: int, method=method) -> pd.DataFrame:
+            found = dqn_table(method, seed, scatter)
+            found.loc[found["task"] == 2, "return"] += shift
+            return found
+
+        plan = made_up_plan(runs_dir, env, method + tag, seeds, config=config)
+        write_seeds(plan, table, lambda seed, m=method: dqn_arrays(m), facts)
+
+
+def csv_of(runs_dir: Path, folder: str, seed: int, env: str = "linear_system") -> Path:
+    return seed_path(runs_dir / "smoke" / env / folder, seed, "csv")
