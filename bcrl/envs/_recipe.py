@@ -1,13 +1,11 @@
 """How a simulator is made: a registered id, arguments, attributes and wrappers."""
 
-from __future__ import annotations
-
 import copy
 import importlib.util
 import inspect
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -38,6 +36,8 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "shimmy": ("dm_control/", "bsuite/"),
 }
 _RESERVED = ("max_episode_steps", "disable_env_checker")  # arguments that bcrl sets
+#: Types of attributes that a config can set.
+_PLAIN = (bool, int, float, str, list, tuple, np.ndarray, np.number)
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class Recipe:
     """
 
     id: str
-    kwargs: Mapping[str, Any] = field(default_factory=dict)
-    attributes: Mapping[str, Any] = field(default_factory=dict)
-    wrappers: tuple[Any, ...] = ()
+    kwargs: dict[str, Any] | None = None
+    attributes: dict[str, Any] | None = None
+    wrappers: list[Any] | None = None
     observation: str | None = None
 
     def __hash__(self) -> int:
@@ -60,13 +60,10 @@ class Recipe:
         """A new environment without a time limit; ConfigError for a wrong key."""
         spec = spec_of(self.id)
         # A copy for each simulator: one that changes a list changes no other's.
-        kwargs: dict = copy.deepcopy(dict(self.kwargs))
-        attributes, wrappers = copy.deepcopy((self.attributes, self.wrappers))
+        kwargs, attributes = copy.deepcopy((self.kwargs or {}, self.attributes or {}))
         point = spec.entry_point
         creator = load_env_creator(point) if isinstance(point, str) else point
-        parameters = _parameters(creator)
-        _check_arguments("env.kwargs", kwargs, parameters)
-        mode = parameters.get("render_mode")
+        mode = _checked("env.kwargs", creator, kwargs).get("render_mode")
         if render_mode or (mode and mode.default is inspect.Parameter.empty):
             kwargs["render_mode"] = "rgb_array"
         with warnings.catch_warnings():  # about precision and old versions
@@ -77,7 +74,7 @@ class Recipe:
             try:
                 for key, value in attributes.items():
                     _set_attribute(env, key, value)
-                for wrapper in wrappers:
+                for wrapper in copy.deepcopy(self.wrappers or ()):
                     env = _wrapped(env, wrapper)
             except BaseException:
                 env.close()
@@ -86,10 +83,8 @@ class Recipe:
 
     def mapping(self) -> Callable[[Any], Any] | None:
         """The function `observation`; ConfigError if it isn't trusted or missing."""
-        if self.observation is None:
-            return None
-        name = str(self.observation)
-        return plugins.attribute("env.observation", name, name)
+        name = self.observation
+        return plugins.attribute("env.observation", name, name) if name else None
 
 
 def spec_of(name: str) -> EnvSpec:
@@ -97,42 +92,35 @@ def spec_of(name: str) -> EnvSpec:
 
     `module:Name-v0` imports the module first: one of PACKAGES or of BCRL_TRUST.
     """
-    module, colon, name_there = name.rpartition(":")
-    if colon:
-        if module in PACKAGES and not importlib.util.find_spec(module):
-            why = f"the package {module} isn't installed: {_pip(module)}"
-            raise ConfigError("env.id", name, why)
+    module, _, plain = name.rpartition(":")
+    if module and not (module in PACKAGES and _missing(module)):
         plugins.module("env.id", name, module, PACKAGES)
-    if name_there in gymnasium.registry:
-        return gymnasium.registry[name_there]
-    for module, beginnings in PACKAGES.items():
-        if name_there.startswith(beginnings):
-            missing = not importlib.util.find_spec(module)
-            first = f"{_pip(module)}, then " if missing else ""
-            why = f"{first}env.id={module}:{name_there} imports the package first"
-            raise ConfigError("env.id", name, why)
-    similar = closest(name_there, gymnasium.registry)
-    hint = f"did you mean env.id={similar}? " if similar else ""
-    why = f"isn't registered; {hint}env.id=module:Name-v0 imports the module first"
+    if plain in gymnasium.registry:
+        return gymnasium.registry[plain]
+    owners = [each for each, begins in PACKAGES.items() if plain.startswith(begins)]
+    if owner := next(iter(owners), module if module in PACKAGES else None):
+        install = f"pip install {owner.replace('_', '-')}, then "
+        why = f"{install if _missing(owner) else ''}env.id={owner}:{plain} imports it"
+    else:
+        similar = closest(plain, gymnasium.registry)
+        hint = f"did you mean env.id={similar}? " if similar else ""
+        why = f"isn't registered; {hint}env.id=module:Name-v0 imports the module first"
     raise ConfigError("env.id", name, why)
 
 
-def _pip(module: str) -> str:
-    return f"pip install {module.replace('_', '-')}"
+def _missing(module: str) -> bool:
+    return importlib.util.find_spec(module) is None
 
 
-def _parameters(creator: Any) -> dict[str, inspect.Parameter]:
+def _checked(
+    key: str, function: Any, arguments: Mapping[str, Any]
+) -> dict[str, inspect.Parameter]:
+    """A function's parameters; ConfigError for an argument unknown or set by bcrl."""
     try:
-        return dict(inspect.signature(creator).parameters)
+        parameters = dict(inspect.signature(function).parameters)
     except (TypeError, ValueError):  # it has no readable signature
-        return {"any": inspect.Parameter("any", inspect.Parameter.VAR_KEYWORD)}
-
-
-def _check_arguments(
-    key: str, arguments: Mapping[str, Any], parameters: dict[str, inspect.Parameter]
-) -> None:
-    """Raise ConfigError for a keyword that is unknown or that bcrl sets."""
-    known = [name for name in parameters if name not in _RESERVED]
+        return {}
+    known = [name for name in parameters if name not in (*_RESERVED, "env")]
     anything = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
     for name, value in arguments.items():
         if name in _RESERVED or (name == "render_mode" and value != "rgb_array"):
@@ -141,29 +129,23 @@ def _check_arguments(
         if name not in known and not anything:
             why = did_you_mean(name, known) if known else "it takes no arguments"
             raise ConfigError(f"{key}.{name}", value, why)
+    return parameters
 
 
 def _set_attribute(env: gymnasium.Env, key: str, value: Any) -> None:
     """Set a plain attribute of the unwrapped environment that survives a reset."""
-    plain = (bool, int, float, str, list, tuple, np.ndarray, np.number)
     there, place = env.unwrapped, f"env.attributes.{key}"
-    known = [
-        name
-        for name in dir(there)
-        if not name.startswith("_")
-        and not isinstance(getattr(type(there), name, None), property)
-        and isinstance(getattr(there, name, None), plain)
-    ]
+    found = inspect.getmembers_static(there, lambda member: isinstance(member, _PLAIN))
+    known = {name: member for name, member in found if not name.startswith("_")}
     if key not in known:
         raise ConfigError(place, value, did_you_mean(key, known))
-    before = getattr(there, key)
+    before = known[key]
     old, new = np.asarray(before), np.asarray(value)
-    numbers = [array.dtype.kind in "iuf" for array in (old, new)]
-    alike = all(numbers) or old.dtype.kind == new.dtype.kind != "O"
+    alike = old.dtype.kind == new.dtype.kind != "O"
+    if {old.dtype.kind, new.dtype.kind} <= set("iuf"):
+        alike = bool(np.isfinite(new).all())
     if not alike or old.shape != new.shape:
-        raise ConfigError(place, value, f"must be like {before!r}")
-    if all(numbers) and not np.isfinite(new).all():
-        raise ConfigError(place, value, "must be finite")
+        raise ConfigError(place, value, f"must be like {before!r}, and finite")
     if isinstance(before, np.ndarray):
         value = new.astype(old.dtype)
     elif isinstance(before, float):
@@ -180,7 +162,6 @@ def _wrapped(env: gymnasium.Env, wrapper: Any) -> gymnasium.Env:
     if not isinstance(wrapper, dict) or not isinstance(wrapper.get("name"), str):
         why = "every wrapper needs a name: {name: RescaleObservation, min_obs: -1}"
         raise ConfigError("env.wrappers", wrapper, why)
-    arguments = {k: v for k, v in wrapper.items() if k != "name"}
     name = wrapper["name"].removeprefix("gymnasium.wrappers.")
     if "." in name:
         foreign = PACKAGES.keys() - {"bcrl", "gymnasium"}
@@ -192,12 +173,13 @@ def _wrapped(env: gymnasium.Env, wrapper: Any) -> gymnasium.Env:
     else:
         why = f"{did_you_mean(name, WRAPPERS)}, or module.Wrapper from a package"
         raise ConfigError("env.wrappers", name, why)
+    given = {k: v for k, v in wrapper.items() if k != "name"}
     place = f"env.wrappers.{name}"
-    _, *parameters = _parameters(cls).items()  # the first one is env
-    _check_arguments(place, arguments, dict(parameters))
-    tuples = {k: tuple(v) if type(v) is list else v for k, v in arguments.items()}
+    _checked(place, cls, given)
     try:
-        return cls(env, **tuples)
+        return cls(
+            env, **{k: tuple(v) if type(v) is list else v for k, v in given.items()}
+        )
     except Exception as error:  # of a wrapper's code
         why = f"the wrapper failed: {type(error).__name__}: {error}"
-        raise ConfigError(place, arguments, why) from error
+        raise ConfigError(place, given, why) from error

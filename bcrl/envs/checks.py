@@ -4,14 +4,11 @@ Here are the checks that pure environments and simulators share, and the trial o
 user's pure environment. `gymnasium.py` has the trial of a simulator.
 """
 
-from __future__ import annotations
-
-import copy
 import functools
 import sys
 import traceback
 from collections.abc import Hashable, Sequence
-from itertools import pairwise
+from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -47,33 +44,24 @@ def described(error: BaseException) -> str:
     ours = {Path(module.__file__ or "").parent for module in loaded}
     foreign = [f for f in files if not ours & {*Path(f.filename).parents}]
     frame = (foreign or files)[-1]
-    first_line = (str(error).strip().splitlines() or [""])[0][:200]
+    first_line = str(error).strip().partition("\n")[0][:200]
     place = f"…/{Path(frame.filename).name}:{frame.lineno}"
     return f"{type(error).__name__}: {first_line} ({place})"
 
 
-def note_resolution(key: str, found: Sequence[str], remedy: str) -> None:
-    """Print a note about the components that `unresolved` has `found`, if any."""
-    if found:
-        more = f" ({len(found) - 1} more like it)" if len(found) > 1 else ""
-        once(f"{key}: {found[0]}{more}; {remedy}")
-
-
-def unresolved(seen: Floats) -> list[str]:
-    """The components of states (n, d) whose values float32 or forests merge."""
+def unresolved(seen: Floats) -> str:
+    """The first component of states (n, d) whose values float32 or forests merge."""
     low, high = seen.min(0), seen.max(0)
     span, largest = high - low, np.maximum(np.abs(low), np.abs(high))
     fineness = np.maximum(np.spacing(largest.astype(np.float32)), RESOLUTION)
-    found = []
     for i in np.flatnonzero((span > 0) & (span < LEVELS * fineness)):
         steps = seen[:, i] - low[i]
         values = np.unique(np.round(steps / span[i] * 1e9))  # rounding errors merge
         if len(np.unique(np.round(steps / fineness[i]))) < len(values):
-            found.append(
-                f"component {i} of the observations lies within {low[i]:.10g} and "
-                f"{high[i]:.10g}, where float32 and forests resolve {fineness[i]:.2g}"
-            )
-    return found
+            where = f"component {i} of the observations lies within {low[i]:.10g} and "
+            where += f"{high[i]:.10g}, where float32 and forests resolve "
+            return f"{where}{fineness[i]:.2g}"
+    return ""
 
 
 def check_different(
@@ -86,66 +74,62 @@ def check_different(
 
     `traces` has one value per step for each task, equal if nothing differs in it.
     """
-    for number, (one, other) in enumerate(pairwise(tasks), start=1):
+    for number in range(1, len(tasks)):
+        one, other = tasks[number - 1 : number + 1]
         same = (one.horizon, one.gamma) == (other.horizon, other.gamma)
-        pairs = zip(traces[number - 1], traces[number], strict=False)
+        pairs: Any = zip(traces[number - 1], traces[number], strict=False)
         if same and all(a == b for a, b in pairs):
+            names = getattr(one, "__dataclass_fields__", ())
+            pairs = [(name, getattr(one, name), getattr(other, name)) for name in names]
+            changes = [f"{name}: {a} → {b}" for name, a, b in pairs if a != b]
             why = f"tasks {number} and {number + 1} behave alike in {episodes} "
             why += "episodes of random play, so the parameter may have no effect "
             why += f"({allowed_by} accepts such tasks)"
-            raise ConfigError("env.tasks", _difference(one, other), why)
-
-
-def _difference(one: Any, other: Any) -> str:
-    """The constants in which two tasks differ."""
-    names = getattr(one, "__dataclass_fields__", ())
-    pairs = [(name, getattr(one, name), getattr(other, name)) for name in names]
-    changes = [f"{name}: {a} → {b}" for name, a, b in pairs if a != b]
-    return ", ".join(changes) or "the same task twice"
+            value = ", ".join(changes) or "the same task twice"
+            raise ConfigError("env.tasks", value, why)
 
 
 def check_pure_tasks(name: str, tasks: Sequence[Env]) -> None:
     """Try a user's tasks; ConfigError for a broken contract or for equal tasks."""
     traces = []
     for task in tasks:
-        trial = _Trial(name, task)
-        trial.play()
-        states = np.concatenate([s.reshape(-1, task.state_dim) for s in trial.states])
-        found = unresolved(states)
-        note_resolution(f"env.name={name}", found, "let step and initial rescale it")
-        traces.append(trial.trace)
+        trace, states = _Trial(name, task).play()
+        if note := unresolved(states):
+            once(f"env.name={name}: {note}; let step and initial rescale it")
+        traces.append(trace)
     if getattr(tasks[-1], "verify", True):
         allowed_by = f"verify = False in the class {type(tasks[-1]).__name__}"
         check_different(tasks, traces, int(np.prod(_LANES)), allowed_by)
 
 
+@dataclass(frozen=True)
 class _Trial:
     """Random episodes in one pure environment, whose every answer is checked."""
 
-    def __init__(self, name: str, env: Env) -> None:
-        self.name, self.env = name, env
-        self.states: list[Floats] = []
-        self.trace: list[Hashable] = []
+    name: str
+    env: Env
 
-    def play(self) -> None:
-        """Call every method of the protocol; ConfigError for a broken contract."""
+    def play(self) -> tuple[list[Hashable], Floats]:
+        """A trace of the episodes, and their states (n, d)."""
         self._check_constants()
         env, rng = self.env, np.random.default_rng(0)
         noise = rng.random((*_LANES, env.initial_noise))
-        (state,) = self._answers("initial", noise, gives={"states": _LANES})
-        self._answers("evaluation_states", gives={"states": (None,)})
-        self.states, self.trace = [state], [state.tobytes()]
+        (state,) = self._answers("initial", noise, states=_LANES)
+        self._answers("evaluation_states", states=(None,))
+        states = [state]
+        trace: list[Hashable] = [state.tobytes()]
         for _ in range(min(env.horizon, _STEPS)):
             lanes = state.shape[:-1]
             action = rng.integers(env.n_actions, size=lanes)
             noise = rng.random((*lanes, env.step_noise))
             gives = dict.fromkeys(("states", "rewards", "absorbing"), lanes)
-            found = self._answers("step", state, action, noise, gives=gives)
-            self.states.append(found[0])
-            self.trace.append(tuple(part.tobytes() for part in found))
+            found = self._answers("step", state, action, noise, **gives)
+            states.append(found[0])
+            trace.append(tuple(part.tobytes() for part in found))
             state = found[0][~found[2]]
             if not state.size:
                 break
+        return trace, np.concatenate([s.reshape(-1, env.state_dim) for s in states])
 
     def _wrong(self, why: str) -> ConfigError:
         return ConfigError("env.name", self.name, f"{why} (docs/howto/own.md)")
@@ -170,7 +154,7 @@ class _Trial:
             raise self._wrong(f"success_threshold is {threshold!r}, {why}")
 
     def _answers(
-        self, method: str, *arguments: NDArray, gives: dict[str, tuple[int | None, ...]]
+        self, method: str, *arguments: NDArray, **gives: tuple[int | None, ...]
     ) -> list[NDArray]:
         """The arrays that a method returns, the same ones for the same arguments.
 
@@ -179,25 +163,21 @@ class _Trial:
         function = getattr(self.env, method)
         before = [argument.copy() for argument in arguments]
         try:
-            first = function(*arguments)
-            kept, again = copy.deepcopy(first), function(*arguments)
+            answers = function(*arguments), function(*arguments)
         except (Exception, SystemExit) as error:
             raise self._wrong(f"{method} failed: {described(error)}") from error
         if not all(map(np.array_equal, arguments, before)):
             raise self._wrong(f"{method} changes its arguments; it must copy them")
-        firsts, found, others = (
-            value if isinstance(value, tuple) else (value,)
-            for value in (first, kept, again)
-        )
-        if not len(found) == len(others) == len(gives):
+        found, again = (x if isinstance(x, tuple) else (x,) for x in answers)
+        if not len(found) == len(again) == len(gives):
             why = f"must give {', '.join(gives)} as a tuple"
             raise self._wrong(f"{method} gives {len(found)} values; it {why}")
-        for noun, one, other, raw in zip(gives, found, others, firsts, strict=True):
-            self._check_array(f"{method}: {noun}", one, gives[noun])
+        for (noun, lanes), one, other in zip(gives.items(), found, again, strict=True):
+            self._check_array(f"{method}: {noun}", one, lanes)
             if not np.array_equal(one, other):
                 why = "must depend on its arguments only; randomness comes in as noise"
                 raise self._wrong(f"{method} gives other {noun} the second time; {why}")
-            if raw is other and getattr(raw, "flags", None) and raw.flags.writeable:
+            if one is other and one.flags.writeable:
                 why = "gives one array again and again; it must make new ones"
                 raise self._wrong(f"{method} {why}")
         dtypes = [bool if noun == "absorbing" else float for noun in gives]

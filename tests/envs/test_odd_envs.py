@@ -163,6 +163,7 @@ def test_a_simulator_that_fails_in_a_run_fails_its_seed_alone(more, tmp_path):
 
 def test_success_in_info_has_to_be_true_or_false():
     simulator = Simulator(Recipe("odd/Walk-v0"))
+    simulator.open()
     for value, expected in ((1, True), (np.array([True]), True), (False, False)):
         simulator.reports = False
         assert simulator._success("step", {"success": value}) is expected
@@ -177,6 +178,7 @@ def test_no_cast_hides_what_float32_cannot_resolve():
     seen = np.array([1.7e9 + 3])
     space = spaces.Dict({"time": spaces.Box(-np.inf, np.inf, (1,), np.float32)})
     simulator = Simulator(Recipe("odd/Walk-v0"))
+    simulator.open()
     assert simulator._flat("reset", space, {"time": seen})[0] == seen[0]
 
 
