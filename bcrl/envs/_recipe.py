@@ -1,11 +1,12 @@
 """How a simulator is made: a registered id, arguments, attributes and wrappers."""
 
 import copy
-import importlib.util
 import inspect
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium
@@ -36,8 +37,6 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "shimmy": ("dm_control/", "bsuite/"),
 }
 _RESERVED = ("max_episode_steps", "disable_env_checker")  # arguments that bcrl sets
-#: Types of attributes that a config can set.
-_PLAIN = (bool, int, float, str, list, tuple, np.ndarray, np.number)
 
 
 @dataclass(frozen=True)
@@ -66,19 +65,16 @@ class Recipe:
         mode = _checked("env.kwargs", creator, kwargs).get("render_mode")
         if render_mode or (mode and mode.default is inspect.Parameter.empty):
             kwargs["render_mode"] = "rgb_array"
-        with warnings.catch_warnings():  # about precision and old versions
-            warnings.simplefilter("ignore", UserWarning)
-            env: gymnasium.Env = gymnasium.make(
-                spec, max_episode_steps=-1, disable_env_checker=True, **kwargs
-            )
-            try:
-                for key, value in attributes.items():
-                    _set_attribute(env, key, value)
-                for wrapper in copy.deepcopy(self.wrappers or ()):
-                    env = _wrapped(env, wrapper)
-            except BaseException:
-                env.close()
-                raise
+        kwargs |= {"max_episode_steps": -1, "disable_env_checker": True}
+        with warnings.catch_warnings(), ExitStack() as undone:
+            warnings.simplefilter("ignore", UserWarning)  # of precision, old versions
+            env: gymnasium.Env = gymnasium.make(spec, **kwargs)
+            undone.callback(env.close)
+            for key, value in attributes.items():
+                _set_attribute(env, key, value)
+            for wrapper in copy.deepcopy(self.wrappers or ()):
+                env = _wrapped(env, wrapper)
+            undone.pop_all()
         return env
 
     def mapping(self) -> Callable[[Any], Any] | None:
@@ -93,23 +89,20 @@ def spec_of(name: str) -> EnvSpec:
     `module:Name-v0` imports the module first: one of PACKAGES or of BCRL_TRUST.
     """
     module, _, plain = name.rpartition(":")
-    if module and not (module in PACKAGES and _missing(module)):
+    if module and (module not in PACKAGES or find_spec(module)):
         plugins.module("env.id", name, module, PACKAGES)
     if plain in gymnasium.registry:
         return gymnasium.registry[plain]
-    owners = [each for each, begins in PACKAGES.items() if plain.startswith(begins)]
-    if owner := next(iter(owners), module if module in PACKAGES else None):
-        install = f"pip install {owner.replace('_', '-')}, then "
-        why = f"{install if _missing(owner) else ''}env.id={owner}:{plain} imports it"
-    else:
-        similar = closest(plain, gymnasium.registry)
-        hint = f"did you mean env.id={similar}? " if similar else ""
-        why = f"isn't registered; {hint}env.id=module:Name-v0 imports the module first"
+    for owner, begins in PACKAGES.items():
+        missing = find_spec(owner) is None
+        if missing if owner == module else plain.startswith(begins):
+            install = f"pip install {owner.replace('_', '-')}, then " if missing else ""
+            why = f"{install}env.id={owner}:{plain} imports the package first"
+            raise ConfigError("env.id", name, why)
+    similar = closest(plain, gymnasium.registry)
+    hint = f"did you mean env.id={similar}? " if similar else ""
+    why = f"isn't registered; {hint}env.id=module:Name-v0 imports the module first"
     raise ConfigError("env.id", name, why)
-
-
-def _missing(module: str) -> bool:
-    return importlib.util.find_spec(module) is None
 
 
 def _checked(
@@ -135,8 +128,9 @@ def _checked(
 def _set_attribute(env: gymnasium.Env, key: str, value: Any) -> None:
     """Set a plain attribute of the unwrapped environment that survives a reset."""
     there, place = env.unwrapped, f"env.attributes.{key}"
-    found = inspect.getmembers_static(there, lambda member: isinstance(member, _PLAIN))
-    known = {name: member for name, member in found if not name.startswith("_")}
+    plain = (bool, int, float, str, list, tuple, np.ndarray, np.number)
+    members = inspect.getmembers_static(there, lambda member: isinstance(member, plain))
+    known = {name: member for name, member in members if not name.startswith("_")}
     if key not in known:
         raise ConfigError(place, value, did_you_mean(key, known))
     before = known[key]

@@ -1,7 +1,5 @@
 """The environment protocol: pure functions on arrays, no state or randomness inside."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from numbers import Integral

@@ -8,7 +8,6 @@ import functools
 import sys
 import traceback
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -65,23 +64,19 @@ def unresolved(seen: Floats) -> str:
 
 
 def check_different(
-    tasks: Sequence[Any],
-    traces: Sequence[Sequence[Hashable]],
-    episodes: int,
-    allowed_by: str,
+    tasks: Sequence[Any], traces: Sequence[Sequence], episodes: int, allowed_by: str
 ) -> None:
-    """Raise ConfigError if successive tasks with equal traces should differ.
-
-    `traces` has one value per step for each task, equal if nothing differs in it.
-    """
+    """Raise ConfigError if successive tasks have equal traces, one value per step."""
     for number in range(1, len(tasks)):
         one, other = tasks[number - 1 : number + 1]
         same = (one.horizon, one.gamma) == (other.horizon, other.gamma)
         pairs: Any = zip(traces[number - 1], traces[number], strict=False)
         if same and all(a == b for a, b in pairs):
-            names = getattr(one, "__dataclass_fields__", ())
-            pairs = [(name, getattr(one, name), getattr(other, name)) for name in names]
-            changes = [f"{name}: {a} → {b}" for name, a, b in pairs if a != b]
+            changes = [
+                f"{name}: {getattr(one, name)} → {getattr(other, name)}"
+                for name in getattr(one, "__dataclass_fields__", ())
+                if getattr(one, name) != getattr(other, name)
+            ]
             why = f"tasks {number} and {number + 1} behave alike in {episodes} "
             why += "episodes of random play, so the parameter may have no effect "
             why += f"({allowed_by} accepts such tasks)"
@@ -93,7 +88,14 @@ def check_pure_tasks(name: str, tasks: Sequence[Env]) -> None:
     """Try a user's tasks; ConfigError for a broken contract or for equal tasks."""
     traces = []
     for task in tasks:
-        trace, states = _Trial(name, task).play()
+        try:
+            trace, states = _trial(task)
+        except ConfigError:
+            raise
+        except (Exception, SystemExit) as error:
+            broken = isinstance(error, _Broken)
+            why = str(error) if broken else f"random play failed: {described(error)}"
+            raise ConfigError("env.name", name, f"{why} (docs/howto/own.md)") from error
         if note := unresolved(states):
             once(f"env.name={name}: {note}; let step and initial rescale it")
         traces.append(trace)
@@ -102,99 +104,80 @@ def check_pure_tasks(name: str, tasks: Sequence[Env]) -> None:
         check_different(tasks, traces, int(np.prod(_LANES)), allowed_by)
 
 
-@dataclass(frozen=True)
-class _Trial:
-    """Random episodes in one pure environment, whose every answer is checked."""
+class _Broken(Exception):
+    """What an environment does against its contract."""
 
-    name: str
-    env: Env
 
-    def play(self) -> tuple[list[Hashable], Floats]:
-        """A trace of the episodes, and their states (n, d)."""
-        self._check_constants()
-        env, rng = self.env, np.random.default_rng(0)
-        noise = rng.random((*_LANES, env.initial_noise))
-        (state,) = self._answers("initial", noise, states=_LANES)
-        self._answers("evaluation_states", states=(None,))
-        states = [state]
-        trace: list[Hashable] = [state.tobytes()]
-        for _ in range(min(env.horizon, _STEPS)):
-            lanes = state.shape[:-1]
-            action = rng.integers(env.n_actions, size=lanes)
-            noise = rng.random((*lanes, env.step_noise))
-            gives = dict.fromkeys(("states", "rewards", "absorbing"), lanes)
-            found = self._answers("step", state, action, noise, **gives)
-            states.append(found[0])
-            trace.append(tuple(part.tobytes() for part in found))
-            state = found[0][~found[2]]
-            if not state.size:
-                break
-        return trace, np.concatenate([s.reshape(-1, env.state_dim) for s in states])
+def _require(kept: bool | np.bool_, why: str) -> None:
+    if not kept:
+        raise _Broken(why)
 
-    def _wrong(self, why: str) -> ConfigError:
-        return ConfigError("env.name", self.name, f"{why} (docs/howto/own.md)")
 
-    def _check_constants(self) -> None:
-        env = self.env
-        for key, least in _NUMBERS.items():
-            value = getattr(env, key, None)
-            if not isinstance(value, Real if key == "gamma" else int) or value < least:
-                raise self._wrong(f"{key} is {value!r}, must be a number ≥ {least}")
-        check_episodes(env.gamma, env.horizon)
-        try:
-            hash(env)
-        except TypeError as error:
-            why = "it must be a frozen dataclass of constants, and "
-            raise self._wrong(f"{why}a tuple instead of a list ({error})") from error
-        rule = getattr(env, "success", "unpunished")
-        threshold = getattr(env, "success_threshold", None)
-        one_of("success", rule, [rule for rule in RULES if rule != "info"])
-        if rule == "threshold" and not isinstance(threshold, Real):
-            why = "must be the return that counts as solved"
-            raise self._wrong(f"success_threshold is {threshold!r}, {why}")
+def _trial(env: Env) -> tuple[list[Hashable], Floats]:
+    """The trace of random episodes whose every answer is checked, and states (n, d)."""
+    for key, least in _NUMBERS.items():
+        value: Any = getattr(env, key, None)
+        kind: Any = Real if key == "gamma" else int
+        number = isinstance(value, kind) and value >= least
+        _require(number, f"{key} is {value!r}, must be a number ≥ {least}")
+    check_episodes(env.gamma, env.horizon)
+    rule = getattr(env, "success", "unpunished")
+    one_of("success", rule, [rule for rule in RULES if rule != "info"])
+    threshold = getattr(env, "success_threshold", None)
+    why = f"success_threshold is {threshold!r}, must be the return of a solved episode"
+    _require(rule != "threshold" or isinstance(threshold, Real), why)
+    try:
+        hash(env)
+    except TypeError as error:
+        why = (
+            "it must be a frozen dataclass of constants, and a tuple instead of a list"
+        )
+        raise _Broken(f"{why} ({error})") from error
+    rng = np.random.default_rng(0)
+    (state,) = _answers(env, "initial", rng.random((*_LANES, env.initial_noise)))
+    _answers(env, "evaluation_states")
+    states = [state]
+    trace: list[Hashable] = [state.tobytes()]
+    for _ in range(min(env.horizon, _STEPS)):
+        lanes = state.shape[:-1]
+        action = rng.integers(env.n_actions, size=lanes)
+        found = _answers(
+            env, "step", state, action, rng.random((*lanes, env.step_noise))
+        )
+        states.append(found[0])
+        trace.append(tuple(part.tobytes() for part in found))
+        state = found[0][~found[2]]
+        if not state.size:
+            break
+    return trace, np.concatenate([s.reshape(-1, env.state_dim) for s in states])
 
-    def _answers(
-        self, method: str, *arguments: NDArray, **gives: tuple[int | None, ...]
-    ) -> list[NDArray]:
-        """The arrays that a method returns, the same ones for the same arguments.
 
-        `gives`: leading axes of each array by its noun; None stands for any length.
-        """
-        function = getattr(self.env, method)
-        before = [argument.copy() for argument in arguments]
-        try:
-            answers = function(*arguments), function(*arguments)
-        except (Exception, SystemExit) as error:
-            raise self._wrong(f"{method} failed: {described(error)}") from error
-        if not all(map(np.array_equal, arguments, before)):
-            raise self._wrong(f"{method} changes its arguments; it must copy them")
-        found, again = (x if isinstance(x, tuple) else (x,) for x in answers)
-        if not len(found) == len(again) == len(gives):
-            why = f"must give {', '.join(gives)} as a tuple"
-            raise self._wrong(f"{method} gives {len(found)} values; it {why}")
-        for (noun, lanes), one, other in zip(gives.items(), found, again, strict=True):
-            self._check_array(f"{method}: {noun}", one, lanes)
-            if not np.array_equal(one, other):
-                why = "must depend on its arguments only; randomness comes in as noise"
-                raise self._wrong(f"{method} gives other {noun} the second time; {why}")
-            if one is other and one.flags.writeable:
-                why = "gives one array again and again; it must make new ones"
-                raise self._wrong(f"{method} {why}")
-        dtypes = [bool if noun == "absorbing" else float for noun in gives]
-        return [np.asarray(x, kind) for x, kind in zip(found, dtypes, strict=True)]
-
-    def _check_array(self, what: str, value: Any, lanes: tuple) -> None:
-        """Raise unless it is a finite array (lanes, …) of the right type."""
-        shape = getattr(value, "shape", None)
-        expected = (*lanes, self.env.state_dim) if what.endswith("states") else lanes
-        if lanes == (None,) and shape and shape[0]:
-            expected = (shape[0], *expected[1:])
-        if shape != expected:
-            raise self._wrong(f"{what} have shape {shape}, expected {expected}")
-        boolean = what.endswith("absorbing")
-        if getattr(value.dtype, "kind", "?") not in ("b" if boolean else "fiu"):
-            noun = "booleans" if boolean else "numbers"
-            raise self._wrong(f"{what} must be {noun}, are {value.dtype}")
-        if not (np.abs(value) <= LARGEST).all():
-            why = f"must be finite and at most {LARGEST:.3g} (float32's largest number)"
-            raise self._wrong(f"{what} {why}")
+def _answers(env: Env, method: str, *arguments: NDArray) -> list[NDArray]:
+    """The arrays that a method returns, the same ones for the same arguments."""
+    before = [argument.copy() for argument in arguments]
+    one, other = (getattr(env, method)(*arguments) for _ in range(2))
+    same = all(map(np.array_equal, arguments, before))
+    _require(same, f"{method} changes its arguments; it must copy them")
+    nouns = ("states", "rewards", "absorbing") if method == "step" else ("states",)
+    firsts, seconds = (x if isinstance(x, tuple) else (x,) for x in (one, other))
+    why = f"{method} gives {len(firsts)} values; it must give {', '.join(nouns)}"
+    _require(len(firsts) == len(seconds) == len(nouns), why)
+    found = []
+    for noun, first, second in zip(nouns, firsts, seconds, strict=True):
+        shape, dtype = getattr(first, "shape", None), getattr(first, "dtype", None)
+        lanes = arguments[0].shape[:-1] if arguments else (shape or (1,))[:1]
+        expected = (*lanes, env.state_dim) if noun == "states" else lanes
+        kinds, words = ("b", "booleans") if noun == "absorbing" else ("fiu", "numbers")
+        why = f"{method}: {noun} have shape {shape} and type {dtype}, "
+        why += f"expected {words} of shape {expected}"
+        _require(shape == expected and getattr(dtype, "kind", "?") in kinds, why)
+        _require(0 not in expected, f"{method}: there are no {noun}")
+        why = f"{method}: {noun} must be finite and at most {LARGEST:.3g} (float32)"
+        _require((np.abs(first) <= LARGEST).all(), why)
+        why = f"{method} gives other {noun} the second time; it must depend on its "
+        why += "arguments only: randomness comes in as noise"
+        _require(np.array_equal(first, second), why)
+        why = f"{method} gives one array again and again; it must make new ones"
+        _require(first is not second or not first.flags.writeable, why)
+        found.append(np.asarray(first, bool if noun == "absorbing" else float))
+    return found

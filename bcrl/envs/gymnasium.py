@@ -16,17 +16,13 @@ from bcrl.common.checks import one_of
 from bcrl.envs._recipe import Recipe, spec_of
 from bcrl.envs.base import RULES, Floats, Ints, check_episodes
 from bcrl.envs.checks import check_different, described, once, unresolved
-from bcrl.envs.simulators import SimulatedLanes, Simulator, is_vector, shortened
+from bcrl.envs.simulators import SimulatedLanes, Simulator, vectors
 from bcrl.errors import BcrlError, ConfigError, at_least
 
 _TRIES = 5  # random episodes that are played in every task before any work,
 _STEPS = 10_000  # with so many steps altogether
 _SECONDS = 5.0  # and for so long
 _KEPT = 4_000_000  # numbers of their observations, to see how fine they are
-_RESCALE = (
-    "rescale: env.wrappers=[{name: RescaleObservation, min_obs: -1, max_obs: 1}] "
-    "where the Box has bounds, else env.observation=module.function"
-)
 
 
 @dataclass(frozen=True)
@@ -35,8 +31,7 @@ class Trial:
 
     n_actions: int
     state_dim: int
-    trace: list[tuple[int, ...]]  # per step, a digest of each episode
-    unsteady: str  # the step that differed when repeated; empty if none did
+    trace: list[tuple]  # per step, a digest of each episode
     fresh: bool  # whether episodes repeat themselves in new simulators only
     notes: list[str]  # about answers that were converted, and components too fine
     success: str  # the rule that `auto` chooses
@@ -73,8 +68,7 @@ class Gymnasium(Recipe):
     name: ClassVar[str] = "gymnasium"
     initial_noise: ClassVar[int] = 1  # the seed of a reset
     step_noise: ClassVar[int] = 0
-    # Every task gets its own values of these from its random episodes.
-    trial: ClassVar[Trial]
+    trial: ClassVar[Trial]  # Every task gets its own value of these.
     n_actions: ClassVar[int]
     state_dim: ClassVar[int]
 
@@ -95,11 +89,12 @@ class Gymnasium(Recipe):
         derived |= {"trial": seen, "n_actions": seen.n_actions}
         for key, value in (derived | {"state_dim": seen.state_dim}).items():
             object.__setattr__(self, key, value)
-        if (vectors := self.action_vectors) is not None:
-            lengths = {len(vector) for vector in vectors}
-            if len(vectors) != seen.n_actions or len(lengths) != 1 or 0 in lengths:
-                why = f"must be {seen.n_actions} vectors of one length, one per action"
-                raise ConfigError("env.action_vectors", vectors, why)
+        own = self.action_vectors
+        lengths = {1} if own is None else {len(vector) for vector in own}
+        number = seen.n_actions if own is None else len(own)
+        if number != seen.n_actions or len(lengths) != 1 or 0 in lengths:
+            why = f"must be {seen.n_actions} vectors of one length, one per action"
+            raise ConfigError("env.action_vectors", own, why)
 
     def _success(
         self, registered: float | None, suits: str
@@ -107,10 +102,10 @@ class Gymnasium(Recipe):
         """The rule, `suits` if it is `auto`, and the threshold of `threshold`."""
         rule, threshold = self.success, self.success_threshold
         one_of("env.success", rule, (*RULES, "auto"))
+        if threshold is not None and rule not in ("auto", "threshold"):
+            why = f"has no effect with env.success={rule}; env.success=threshold"
+            raise ConfigError("env.success_threshold", threshold, why)
         if threshold is not None:
-            if rule not in ("auto", "threshold"):
-                why = f"has no effect with env.success={rule}; env.success=threshold"
-                raise ConfigError("env.success_threshold", threshold, why)
             return "threshold", float(threshold)
         if rule == "auto":
             rule = suits
@@ -165,18 +160,9 @@ class Gymnasium(Recipe):
 
     @staticmethod
     def check_tasks(tasks: Sequence["Gymnasium"]) -> None:
-        """Raise ConfigError for tasks that are alike or not reproducible.
-
-        Notes name answers that were converted, and components too fine for float32.
-        """
+        """Raise ConfigError for tasks that are alike; print their notes."""
         for task in tasks:
-            seen = task.trial
-            if seen.unsteady:
-                why = f"{seen.unsteady} differs after the same reset and actions; "
-                why += "expected the same each time: randomness from reset(seed=…) "
-                why += "only, no state that outlives a reset or that simulators share"
-                raise ConfigError("env.id", task.id, why)
-            for note in seen.notes:
+            for note in task.trial.notes:
                 once(f"env.id={task.id}: {note}")
         if tasks[-1].verify:
             traces = [task.trial.trace for task in tasks]
@@ -191,7 +177,7 @@ def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
     """
     simulators = [Simulator(recipe) for _ in range(_TRIES)]
     first = simulators[0]
-    trace: list[tuple[int, ...]] = []
+    trace: list[tuple] = []
     seen: list[Floats] = []
     rewards: list[float] = []
     try:
@@ -203,10 +189,10 @@ def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
         for outcomes in itertools.zip_longest(*played):
             running = [outcome for outcome in outcomes if outcome]
             if len(seen) * first.state_dim < _KEPT:
-                seen += [state for state, *_ in running]
+                seen += [state for _, state, *_ in running]
             if trace:
-                rewards += [reward for _, reward, ended, _ in running if not ended]
-            trace.append(tuple(map(_digest, outcomes)))
+                rewards += [reward for *_, reward, ended in running if not ended]
+            trace.append(tuple(outcome and outcome[0] for outcome in outcomes))
             if time.monotonic() > deadline:
                 break
     finally:
@@ -214,20 +200,24 @@ def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
             simulator.close()
     notes = []
     if recipe.observation is None and not isinstance(first.space, spaces.Box):
-        note = f"observations, {shortened(first.space)}, are flattened to "
+        note = f"observations, {str(first.members)[:90]}, are flattened to "
         notes.append(f"{note}{first.state_dim} numbers, as by FlattenObservation")
     unsteady = _unsteady(recipe, actions, trace, False) if verify else ""
-    fresh = bool(unsteady) and not _unsteady(recipe, actions, trace, True)
-    if fresh:
+    if unsteady and _unsteady(recipe, actions, trace, True):
+        why = f"{unsteady} differs after the same reset and actions; expected the same "
+        why += "each time: randomness from reset(seed=…) only, no state that outlives "
+        why += "a reset or that simulators share"
+        raise ConfigError("env.id", recipe.id, why)
+    if unsteady:
         notes.append("a reset leaves something behind, so each episode has a new one")
-        unsteady = ""
     if coarse := unresolved(np.array(seen)):
-        notes.append(f"{coarse}; {_RESCALE}")
+        wrapper = "{name: RescaleObservation, min_obs: -1, max_obs: 1}"
+        where = "where the Box has bounds, else env.observation=module.function"
+        notes.append(f"{coarse}; rescale: env.wrappers=[{wrapper}] {where}")
     reports = any(simulator.reports for simulator in simulators)
     low, high = min(rewards, default=0.0), max(rewards, default=0.0)
     rule = default_success(reports, low, high, spec_of(recipe.id).reward_threshold)
-    space = n_actions, first.state_dim
-    return Trial(*space, trace, unsteady, fresh, notes, rule)
+    return Trial(n_actions, first.state_dim, trace, bool(unsteady), notes, rule)
 
 
 def default_success(
@@ -250,17 +240,13 @@ def default_success(
 
 
 def _episode(simulator: Simulator, number: int, actions: list[int]) -> Iterator[tuple]:
-    """Observation, reward, terminated, truncated after the reset and each step."""
-    yield simulator.reset((number + 0.5) / _TRIES), 0.0, False, False
-    for action in actions:
-        outcome = simulator.step(action)
-        yield outcome
-        if any(outcome[2:]):  # ended or cut
+    """A digest, observation, reward and end after the reset and each step."""
+    outcome = simulator.reset((number + 0.5) / _TRIES), 0.0, False, False
+    for action in [*actions, None]:
+        yield hash((outcome[0].tobytes(), *outcome[1:])), *outcome[:3]
+        if action is None or any(outcome[2:]):  # terminated or truncated
             return
-
-
-def _digest(outcome: tuple | None) -> int:
-    return hash(outcome and (outcome[0].tobytes(), *outcome[1:]))
+        outcome = simulator.step(action)
 
 
 def _unsteady(recipe: Recipe, actions: NDArray, trace: list, fresh: bool) -> str:
@@ -273,9 +259,10 @@ def _unsteady(recipe: Recipe, actions: NDArray, trace: list, fresh: bool) -> str
         for number, own in enumerate(actions.tolist()):
             played = _episode(simulator, number, own)
             for t, (outcome, expected) in enumerate(zip(played, trace, strict=False)):
-                if _digest(outcome) != expected[number]:
-                    where = f"step {t}" if t else "the reset"
-                    return f"{where} of episode {number + 1}"
+                if outcome[0] != expected[number]:
+                    return (
+                        f"{f'step {t}' if t else 'the reset'} of episode {number + 1}"
+                    )
     return ""
 
 
@@ -289,11 +276,11 @@ def _n_actions(simulator: Simulator) -> int:
         why = f"has actions {actions}, only Discrete ones can be learned; {hint}"
     elif not isinstance(space, spaces.Space):
         why = f"has the observation_space {space!r}, expected a space of gymnasium's"
-    elif recipe.observation is None and not is_vector(space):
+    elif recipe.observation is None and vectors(space) is None:
         hints = ["env.observation=module.function makes an array of them"]
         if isinstance(space, spaces.Dict):
-            keys = ", ".join(str(k) for k, v in space.spaces.items() if is_vector(v))
-            wrapper = f"{{name: FilterObservation, filter_keys: [{keys}]}}"
+            keys = [str(k) for k, part in space.items() if vectors(part) is not None]
+            wrapper = f"{{name: FilterObservation, filter_keys: [{', '.join(keys)}]}}"
             hints.insert(0, f"env.wrappers=[{wrapper}]")
         if recipe.id.startswith("minigrid:"):
             hints.insert(0, "env.wrappers=[{name: minigrid.wrappers.ImgObsWrapper}]")

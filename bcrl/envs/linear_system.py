@@ -23,8 +23,7 @@ ACTIONS = np.array(
     [[1, 0], [0, 1], [-1, 0], [0, -1]]
     + [[a * DIAGONAL, b * DIAGONAL] for a in (1, -1) for b in (1, -1)]
 )
-#: preset → task → gain, friction, half-widths of the start's box (paper, C.3; released
-#: code)
+#: preset → task → gain, friction, half-widths of the start's box (C.3; released code)
 _PRESETS = {
     "released": {
         "lq": (2.0, 0.1, (0.3, 0.3, 0.3, 0.3)),
@@ -88,14 +87,14 @@ class LinearSystem:
         standard deviations sustain; the drift may lead beyond the walls by one step.
         """
         gain, friction, spread = self.constants
-        noise = 10.0 * NOISE
-        fast = [max(spread[i], (gain + noise) / friction) for i in (1, 3)]
-        if self.task == "lq":
-            high = np.array([np.inf, fast[0], np.inf, fast[1]])
-            return np.stack([-high, high])
-        beyond = DT * (abs(self.drift) + noise)
-        low = [WALLS[0] - beyond, -fast[0], -PATHWAY, -fast[1]]
-        return np.array([low, [WALLS[1] + beyond, fast[0], PATHWAY, fast[1]]])
+        fast = [max(spread[i], (gain + 10.0 * NOISE) / friction) for i in (1, 3)]
+        found = np.array([[-np.inf], [np.inf]]).repeat(4, 1)
+        found[:, [1, 3]] = np.array([[-1.0], [1.0]]) * fast
+        if self.task == "target":
+            beyond = DT * (abs(self.drift) + 10.0 * NOISE)
+            found[:, 0] = WALLS[0] - beyond, WALLS[1] + beyond
+            found[:, 2] = -PATHWAY, PATHWAY
+        return found
 
     @property
     def linear_quadratic(self) -> tuple[Floats, ...] | None:
@@ -103,9 +102,8 @@ class LinearSystem:
         if self.task != "lq":
             return None
         gain, friction, _ = self.constants
-        drift = np.kron(np.eye(2), np.array([[0.0, 1.0], [0.0, -friction]]))
-        push = np.kron(np.eye(2), np.array([[0.0], [gain]]))
-        a, b = np.eye(4) + DT * drift, DT * push
+        a = np.kron(np.eye(2), np.array([[1.0, DT], [0.0, 1.0 - DT * friction]]))
+        b = np.kron(np.eye(2), np.array([[0.0], [DT * gain]]))
         return a, b, np.diag(STATE_COST), ACTION_COST * np.eye(2)
 
     @property
@@ -128,8 +126,8 @@ class LinearSystem:
         """One step with any force (..., 2); the fresh start, if any, is in `noise`."""
         rows = map(_rows, (state, force, ndtri(noise[..., :4]), noise))
         lead, spread = np.shape(state)[:-1], self.constants[2]
-        found = _push(*rows, self._dynamics, spread, self.task == "lq")
-        after, reward, arrived = found
+        lq = self.task == "lq"
+        after, reward, arrived = _push(*rows, self._dynamics, spread, lq)
         return after.reshape(*lead, 4), reward.reshape(lead), arrived.reshape(lead)
 
     def before_reset(self, state: Floats, action: Ints, noise: Floats) -> Floats:

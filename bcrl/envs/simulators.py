@@ -25,8 +25,6 @@ _SUCCESS_KEYS = ("is_success", "success")  # of info
 _VECTORS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 #: Errors that end more than one simulator.
 _PASSING = (BcrlError, Interrupted, KeyboardInterrupt, GeneratorExit)
-_SHORT = reprlib.Repr()
-_SHORT.maxother = 90
 
 
 class BrokenSimulator(BcrlError):
@@ -63,8 +61,8 @@ class Simulator:
         self._finalizer = weakref.finalize(self, _close, self.env)
         self.seen = np.empty(0)
         self.space = self._call("observation_space", lambda: self.env.observation_space)
+        self.members = vectors(self.space)
         self.actions = self._call("action_space", lambda: self.env.action_space)
-        self._first_action: Any = getattr(self.actions, "start", 0)
 
     def close(self) -> None:
         """Close the environment."""
@@ -85,7 +83,7 @@ class Simulator:
 
     def _reset(self) -> Floats:
         answer = self._call("reset", self.env.reset, seed=int(self.number * _SEEDS))
-        seen, info = self._values("reset", answer, 2, "an observation and a dict")
+        seen, info = self._values("reset", answer, "an observation, a dict")
         self.succeeded = self._success("reset", info)
         self.seen = self._vector("reset", seen)
         return self.seen
@@ -95,17 +93,16 @@ class Simulator:
         if self.env is None:
             self._replay()
         self.taken.append(action)
-        answer = self._call("step", self.env.step, action + self._first_action)
-        names = "observation, reward, terminated, truncated and info"
-        seen, reward, ended, cut, info = self._values("step", answer, 5, names)
+        first = getattr(self.actions, "start", 0)
+        answer = self._call("step", self.env.step, first + action)
+        names = "observation, reward, terminated, truncated, info"
+        seen, reward, ended, cut, info = self._values("step", answer, names)
         self.seen = self._vector("step", seen)
-        plain = (
-            self._plain("reward", reward, float),
-            self._plain("terminated", ended, bool),
-            self._plain("truncated", cut, bool),
-        )
+        number = self._plain("reward", reward, float)
+        ended = self._plain("terminated", ended, bool)
+        cut = self._plain("truncated", cut, bool)
         self.succeeded = self._success("step", info)
-        return self.seen, *plain
+        return self.seen, number, ended, cut
 
     def _replay(self) -> None:
         number, taken, seen = self.number, self.taken, self.seen
@@ -129,71 +126,57 @@ class Simulator:
         except _PASSING:
             raise
         except BaseException as error:  # any foreign error, SystemExit too
-            missing = isinstance(error, ModuleNotFoundError) and error.name
-            install = f"pip install {missing.partition('.')[0]}, or " if missing else ""
-            expected = f"no error; {install}mend the environment"
-            if method == "reset":
-                expected += " (reset(*, seed=None, options=None))"
-            raise self.broken(method, f"raised {described(error)}", expected) from error
+            problem = f"raised {described(error)}"
+            expected = "no error, and the methods of Gymnasium 0.26 and later"
+            raise self.broken(method, problem, expected) from error
 
-    def _values(self, method: str, answer: Any, count: int, names: str) -> Any:
-        is_sequence = isinstance(answer, (tuple, list))
-        if is_sequence and len(answer) == count:
+    def _values(self, method: str, answer: Any, names: str) -> Any:
+        """The values of an answer, as many as `names` says."""
+        sequence, count = isinstance(answer, (tuple, list)), names.count(",") + 1
+        if sequence and len(answer) == count:
             return answer
-        found = f"{len(answer)} values" if is_sequence else _shown(answer)
-        expected = f"{count} values, {names}, as in Gymnasium 0.26 and later"
+        found = f"{len(answer)} values" if sequence else _shown(answer)
+        expected = f"{count} values: {names}, as in Gymnasium 0.26 and later"
         raise self.broken(method, f"gave {found}", expected)
 
     def _vector(self, method: str, seen: Any) -> Floats:
         """An observation as a new vector (d,) of finite numbers."""
-        space = self.space
+        space = self.members
         if self._map is not None:
             method, space = f"env.observation={self.recipe.observation}", None
             seen = self._call(method, self._map, seen)
-        vector = np.array(self._flat(method, space, seen), np.float64)
+        if space is None or isinstance(space, spaces.Box):
+            seen = array = self._call(method, np.asarray, seen)
+            fits = array.dtype.kind in "biuf"
+            fits &= space is None or array.size == math.prod(space.shape)
+        elif fits := self._call(method, space.contains, seen):
+            array = self._call(method, spaces.flatten, space, seen)
+        if not fits:
+            expected = f"real numbers, a member of {str(space)[:90]}"
+            raise self.broken(method, f"gave {_shown(seen)}", expected)
+        vector = np.array(array, np.float64).reshape(-1)
         d = self.state_dim = self.state_dim or len(vector)
         if len(vector) != max(d, 1):
             expected = f"{max(d, 1)} or, at the first reset, more"
             raise self.broken(method, f"gave {len(vector)} numbers", expected)
         if not np.abs(vector).max() <= LARGEST:
-            place = np.flatnonzero(~(np.abs(vector) <= LARGEST))[0]
-            problem = f"gave an observation with {vector[place]} as component {place}"
-            expected = f"finite numbers of at most {LARGEST:.3g} (float32); "
-            expected += "a wrapper in env.wrappers may rescale them"
-            raise self.broken(method, problem, expected)
+            worst = vector[np.argmin(np.abs(vector) <= LARGEST)]
+            expected = f"finite numbers of at most {LARGEST:.3g} (float32)"
+            raise self.broken(method, f"gave {worst} in an observation", expected)
         return vector
-
-    def _flat(self, method: str, space: spaces.Space | None, seen: Any) -> NDArray:
-        """A member of `space` (None: any numbers) as a vector, without a cast."""
-        if (parts := _parts(space)) is not None:
-            sequence = isinstance(seen, (tuple, list))
-            keys = range(len(seen)) if sequence else seen
-            if (sequence or isinstance(seen, dict)) and set(keys) == parts.keys():
-                found = (
-                    self._flat(f"{method} [{key!r}]", part, seen[key])
-                    for key, part in parts.items()
-                )
-                return np.concatenate([np.empty(0), *found])
-        elif space is None or isinstance(space, spaces.Box):
-            array = self._call(method, np.asarray, seen)
-            fits = space is None or array.size == math.prod(space.shape)
-            if fits and array.dtype.kind in "biuf":
-                return array.reshape(-1)
-        elif self._call(method, space.contains, seen):
-            return self._call(method, spaces.flatten, space, seen)
-        member = f", a member of {shortened(space)}" if space else ""
-        raise self.broken(method, f"gave {_shown(seen)}", f"real numbers{member}")
 
     def _plain(self, name: str, value: Any, kind: type[float]) -> Any:
         """One finite number (kind float) or one boolean, from an array or a scalar."""
         if type(value) is kind and math.isfinite(value):
             return value
         array = self._call(f"step's {name}", np.asarray, value)
-        number = array.dtype.kind in "biuf" and np.isfinite(array).all()
-        if array.size != 1 or not (_is_boolean(array) if kind is bool else number):
+        number = (
+            array.item() if array.size == 1 and array.dtype.kind in "biuf" else None
+        )
+        if number is None or not math.isfinite(number) or kind(number) != number:
             expected = "True or False" if kind is bool else "one finite real number"
             raise self.broken("step", f"gave {name} {_shown(value)}", expected)
-        return kind(array.item())
+        return kind(number)
 
     def _success(self, method: str, info: Any) -> bool:
         """Whether info reports a success; a rate, a text or None reports nothing."""
@@ -201,11 +184,10 @@ class Simulator:
             problem = f"gave info {_shown(info)}"
             raise self.broken(method, problem, "a dict as last value")
         for key in _SUCCESS_KEYS:
-            if key in info:
-                value = self._call(f'{method}\'s info["{key}"]', np.asarray, info[key])
-                if _is_boolean(value):
-                    self.reports = True
-                    return bool(value.all())
+            value = self._call(f"{method}'s info of {key}", np.asarray, info.get(key))
+            if value.dtype.kind in "biuf" and np.isin(value, (0, 1)).all():
+                self.reports = True
+                return bool(value.all())
         return False
 
 
@@ -226,11 +208,7 @@ class SimulatedLanes(Lanes):
         return self.restart(np.ones(self.shape, bool), start, state)
 
     def step(
-        self,
-        state: Floats | None,
-        action: NDArray,
-        noise: Floats | None,
-        lanes: Any = ...,
+        self, state: Any, action: NDArray, noise: Any, lanes: Any = ...
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Observations, rewards, terminated and truncated of the chosen lanes."""
         otherwise = np.zeros(self.env.state_dim), 0.0, False, True
@@ -274,36 +252,28 @@ class SimulatedLanes(Lanes):
         return otherwise
 
 
-def is_vector(space: spaces.Space) -> bool:
-    """Whether the members of a space can be flattened to a vector of fixed length."""
-    parts = _parts(space)
-    if parts is None:
-        return isinstance(space, _VECTORS)
-    return all(map(is_vector, parts.values()))
+def vectors(space: Any) -> spaces.Space | None:
+    """A space whose members become vectors of one length, its Boxes without bounds.
 
-
-def _parts(space: spaces.Space | None) -> dict[Any, spaces.Space] | None:
-    """The spaces inside a Dict or Tuple by key or place; None for other spaces."""
+    So no cast hides what float32 does not resolve. None for other spaces.
+    """
+    if isinstance(space, spaces.Box):
+        return spaces.Box(-np.inf, np.inf, space.shape, np.float64)
+    if isinstance(space, spaces.Dict):
+        named: Any = [(key, vectors(part)) for key, part in space.items()]
+        return None if any(part is None for _, part in named) else spaces.Dict(named)
     if isinstance(space, spaces.Tuple):
-        return dict(enumerate(space.spaces))
-    return space.spaces if isinstance(space, spaces.Dict) else None
-
-
-def shortened(value: Any) -> str:
-    """A value of foreign code in a message: one short line."""
-    return " ".join(_SHORT.repr(value).split())
+        parts: Any = list(map(vectors, space))
+        return None if None in parts else spaces.Tuple(parts)
+    return space if isinstance(space, _VECTORS) else None
 
 
 def _shown(value: Any) -> str:
-    """A wrong value in a message, with its type."""
+    """A wrong value in a message, on one short line, with its type."""
     if isinstance(value, np.ndarray) and value.ndim:
         return f"an array of shape {value.shape} and type {value.dtype}"
-    return f"{shortened(value)} of type {type(value).__name__}"
-
-
-def _is_boolean(array: NDArray) -> bool:
-    """Whether all entries are booleans, or the numbers 0 and 1."""
-    return array.dtype.kind in "biuf" and bool(((array == 0) | (array == 1)).all())
+    text = " ".join(reprlib.repr(value).split())
+    return f"{text} of type {type(value).__name__}"
 
 
 def _close(env: gymnasium.Env) -> None:
