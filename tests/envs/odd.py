@@ -155,7 +155,6 @@ SAME = {
     "Bare": see(float, box()),
     "InATuple": see(lambda at: (cell(at),), Tuple((box(1),))),
     "InADict": see(lambda at: {"a": {"b": cell(at)}}, Dict(a=Dict(b=box(1)))),
-    "LegacySeed": first(np.random.RandomState),
     "SignedSeed": first(lambda n: np.array(n).astype(np.int32, casting="same_value")),
     "CloseFails": {"close": lambda self: fail(RuntimeError("nothing to close"))},
 }

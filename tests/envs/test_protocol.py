@@ -1,4 +1,4 @@
-"""Errors in a user's environment or script are named before any work."""
+"""What holds for all our environments; a user's errors are named before any work."""
 
 import sys
 from dataclasses import dataclass
@@ -8,6 +8,9 @@ import pytest
 from sklearn.neighbors import KNeighborsRegressor
 
 from bcrl.api import FQI, Boost, Forest, ResidualPolicy, Tabular, run, stages
+from bcrl.envs.car_on_hill import CarOnHill
+from bcrl.envs.linear_system import LinearSystem
+from bcrl.envs.maze import Maze
 from bcrl.errors import ConfigError
 from tests.toys import OpenCorridor
 
@@ -53,6 +56,38 @@ WRONG = {
 def test_a_broken_contract_is_named(words):
     with pytest.raises(ConfigError, match=words):
         stages([variant(**WRONG[words])], LEARNER)
+
+
+@pytest.mark.parametrize(
+    "env", [CarOnHill(1.2), Maze(0.55), LinearSystem(), LinearSystem("lq")], ids=repr
+)
+def test_a_batch_steps_as_its_lanes_do(env):
+    rng = np.random.default_rng(0)
+    state = env.initial(rng.random((6, 7, env.initial_noise)))
+    for _ in range(20):
+        action = rng.integers(env.n_actions, size=(6, 7))
+        given = state, action, rng.random((6, 7, env.step_noise))
+        together = env.step(*given)
+        for lane in np.ndindex(6, 7):
+            alone = env.step(*(x[lane] for x in given))
+            for many, one in zip(together, alone, strict=True):
+                assert many[lane].tobytes() == one.tobytes()
+        state = together[0]
+
+
+IMPOSSIBLE = {
+    CarOnHill: {"mass": (0.0, np.nan, np.inf), "gamma": (1.0,), "horizon": (0,)},
+    Maze: {"height": (1.0,), "preset": ("relesed",)},
+    LinearSystem: {"task": ("lqr",), "preset": ("relesed",), "gamma": (-0.1, np.nan)},
+}
+
+
+@pytest.mark.parametrize("cls", IMPOSSIBLE)
+def test_impossible_constants_are_rejected_by_name(cls):
+    for key, values in IMPOSSIBLE[cls].items():
+        for bad in values:
+            with pytest.raises(ConfigError, match=rf"env\.{key}={bad}"):
+                cls(**{key: bad})
 
 
 def test_an_environment_that_is_right_passes():
