@@ -167,13 +167,11 @@ def _wrapped(env: gymnasium.Env, wrapper: Any) -> gymnasium.Env:
     else:
         why = f"{did_you_mean(name, WRAPPERS)}, or module.Wrapper from a package"
         raise ConfigError("env.wrappers", name, why)
-    given = {k: v for k, v in wrapper.items() if k != "name"}
-    place = f"env.wrappers.{name}"
+    items = ((k, tuple(v) if type(v) is list else v) for k, v in wrapper.items())
+    given, place = {k: v for k, v in items if k != "name"}, f"env.wrappers.{name}"
     _checked(place, cls, given)
     try:
-        return cls(
-            env, **{k: tuple(v) if type(v) is list else v for k, v in given.items()}
-        )
+        return cls(env, **given)
     except Exception as error:  # of a wrapper's code
         why = f"the wrapper failed: {type(error).__name__}: {error}"
         raise ConfigError(place, given, why) from error

@@ -27,8 +27,7 @@ LEVELS = 10_000  # a component with more distinct values is fine enough
 _LANES = (16, 4)  # leading axes of the states in a pure environment's trial
 _STEPS = 200  # of each of these episodes
 #: Numbers that an environment needs, and the least value of each.
-_NUMBERS = {"n_actions": 1, "state_dim": 1, "horizon": 1, "gamma": 0}
-_NUMBERS |= {"initial_noise": 0, "step_noise": 0}
+_NUMBERS = {"n_actions": 1, "state_dim": 1, "initial_noise": 0, "step_noise": 0}
 _LIBRARIES = ("bcrl", "gymnasium", "numpy")  # no place of an error in foreign code
 
 #: Print a note, once per process.
@@ -116,9 +115,8 @@ def _require(kept: bool | np.bool_, why: str) -> None:
 def _trial(env: Env) -> tuple[list[Hashable], Floats]:
     """The trace of random episodes whose every answer is checked, and states (n, d)."""
     for key, least in _NUMBERS.items():
-        value: Any = getattr(env, key, None)
-        kind: Any = Real if key == "gamma" else int
-        number = isinstance(value, kind) and value >= least
+        value = getattr(env, key, None)
+        number = isinstance(value, int) and value >= least
         _require(number, f"{key} is {value!r}, must be a number ≥ {least}")
     check_episodes(env.gamma, env.horizon)
     rule = getattr(env, "success", "unpunished")

@@ -45,8 +45,8 @@ class GymEnv(gymnasium.Env):
         self._path: list[Floats] = []  # the episode's states
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Floats, dict[str, Any]]:
+        self, *, seed: int | None = None, options: Any = None
+    ) -> tuple[Any, dict]:
         """A start state; with a `seed`, the same one each time."""
         super().reset(seed=seed)
         noise = self.np_random.random(self.task.initial_noise)
@@ -99,16 +99,11 @@ class GymVectorEnv(VectorEnv):
         self._steps = np.zeros(num_envs, np.intp)
         self._over = np.zeros(num_envs, bool)
 
-    def reset(
-        self,
-        *,
-        seed: int | list[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> tuple[Floats, dict[str, Any]]:
-        """Start states (num_envs, d)."""
-        if not isinstance(seed, list):
-            seed = [seed if seed is None else seed + i for i in range(self.num_envs)]
-        for i, own in enumerate(seed):
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Floats, dict]:
+        """Start states (num_envs, d); `seed` is a number, a list of them, or None."""
+        if isinstance(seed, (int, np.integer)):
+            seed = [seed + i for i in range(self.num_envs)]
+        for i, own in enumerate(seed or ()):
             if own is not None:
                 self._rngs[i], _ = seeding.np_random(own)
         self._begin(np.ones(self.num_envs, bool))

@@ -117,8 +117,8 @@ SENSELESS = {
     "tasks=m: ": ("maze", LEARNER),
     "tasks=<class": ([OpenCorridor], LEARNER),
     "tasks=None": ([None], LEARNER),
-    "horizon is 0": ([OpenCorridor(horizon=0)], LEARNER),
-    "horizon is 3.0": ([OpenCorridor(horizon=3.0)], LEARNER),
+    "env.horizon=0": ([OpenCorridor(horizon=0)], LEARNER),
+    "env.horizon=3.0": ([OpenCorridor(horizon=3.0)], LEARNER),
     "env.gamma=1.0": ([OpenCorridor(gamma=1.0)], LEARNER),
 }
 
