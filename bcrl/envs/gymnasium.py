@@ -200,7 +200,8 @@ def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
             simulator.close()
     notes = []
     if recipe.observation is None and not isinstance(first.space, spaces.Box):
-        note = f"observations, {str(first.members)[:90]}, are flattened to "
+        space = " ".join(str(first.space).split())[:90]
+        note = f"observations, {space}, are flattened to "
         notes.append(f"{note}{first.state_dim} numbers, as by FlattenObservation")
     unsteady = _unsteady(recipe, actions, trace, False) if verify else ""
     if unsteady and _unsteady(recipe, actions, trace, True):
