@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -15,7 +15,7 @@ from bcrl.errors import ConfigError, did_you_mean
 NOUNS = {int: "an integer", float: "a number", str: "text", bool: "true or false"}
 
 
-def one_of(key: str, value: object, allowed: Sequence[str]) -> None:
+def one_of(key: str, value: object, allowed: Collection[str]) -> None:
     """Raise ConfigError unless `value` is one of `allowed`."""
     if value not in allowed:
         raise ConfigError(key, value, did_you_mean(str(value), allowed))

@@ -18,8 +18,7 @@ from bcrl.common.identity import Plain, differences, flat
 from bcrl.config.algorithms import algorithm
 from bcrl.config.schema import Choice, Config, check_name, check_path
 from bcrl.config.variant import Composition, composition
-from bcrl.envs import Env, check_tasks
-from bcrl.envs.tasks import tasks_of
+from bcrl.envs import Env, check_tasks, tasks_of
 from bcrl.errors import ConfigError, at_least, did_you_mean
 from bcrl.evaluation.metrics import check_metrics
 from bcrl.learning.stage import Stage

@@ -1,27 +1,20 @@
 """The tasks: one file per environment, each a frozen dataclass named `ENV`."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Sequence
 
 from bcrl.common import plugins
+from bcrl.common.checks import construct
+from bcrl.common.identity import Plain
 from bcrl.common.registration import REGISTERED
 from bcrl.envs.base import Env, FiniteEnv, Success, is_finite, is_simulated, lanes_of
 from bcrl.envs.checks import check_pure_tasks
 from bcrl.errors import BcrlError, ConfigError, did_you_mean
 
-__all__ = [
-    "Env",
-    "FiniteEnv",
-    "Success",
-    "check_tasks",
-    "env_class",
-    "env_names",
-    "is_finite",
-    "is_simulated",
-    "lanes_of",
-]
+__all__ = ["Env", "FiniteEnv", "Success", "is_finite", "is_simulated", "lanes_of"]
+__all__ += ["check_tasks", "env_class", "env_names", "tasks_of"]
+#: Keys of a config's `env` section that are no constants of an environment.
+_OTHERS = ("name", "tasks", "metrics", "paper_seeds")
 
 
 def env_names() -> list[str]:
@@ -34,17 +27,13 @@ def check_tasks(name: str, tasks: Sequence[Env]) -> None:
 
     A user's environments and simulators are tried; tests cover the package's own.
     """
-    target = tasks[-1]
-    for number, task in enumerate(tasks, start=1):
-        for key in ("state_dim", "n_actions"):
-            here, there = getattr(task, key, None), getattr(target, key, None)
-            if here != there:
-                why = f"task {number} has {key} {here}, the target {there}; "
-                why += "expected the same in all tasks"
-                if is_simulated(target) and key == "state_dim":
-                    why += ": a function env.observation can make them equal"
-                raise ConfigError("env.tasks", key, why)
-    if is_simulated(target):
+    for key in ("state_dim", "n_actions"):
+        found = [getattr(task, key, None) for task in tasks]
+        if found.count(found[0]) < len(found):
+            why = f"is {found}, expected the same in all tasks; "
+            why += "env.tasks.observation can make observations of one length"
+            raise ConfigError("env.tasks", key, why)
+    if is_simulated(target := tasks[-1]):
         target.check_tasks(tasks)
     elif name not in env_names():
         check_pure_tasks(name, tasks)
@@ -60,3 +49,32 @@ def env_class(name: str) -> type:
     if name not in env_names():
         raise BcrlError(f"env.name={name}: {did_you_mean(name, env_names())}")
     return importlib.import_module(f"bcrl.envs.{name}").ENV
+
+
+def tasks_of(section: Plain) -> list[Env]:
+    """The environment's tasks, easiest first, the target last.
+
+    Raises ConfigError if the section describes no tasks.
+    """
+    if not isinstance(section, dict) or not isinstance(section.get("name"), str):
+        raise ConfigError("env", section, "must have a name")
+    cls = env_class(section["name"])
+    constants = {k: v for k, v in section.items() if k not in _OTHERS}
+    return [construct("env", cls, constants | own) for own in _parameters(section)]
+
+
+def _parameters(section: dict) -> list[dict]:
+    """The values that each task sets; a null leaves a parameter out."""
+    parameters = section.get("tasks")
+    if not isinstance(parameters, dict) or not parameters:
+        raise ConfigError("env.tasks", parameters, "must map a parameter to its values")
+    varied = {k: v for k, v in parameters.items() if v is not None}
+    lengths = {len(v) if isinstance(v, list) else 0 for v in varied.values()}
+    if len(lengths) > 1 or 0 in lengths:
+        why = "every parameter needs a list with one value per task, all equally long"
+        raise ConfigError("env.tasks", varied, why)
+    for name in varied:
+        if section.get(name):  # {}, [] and null set nothing
+            raise ConfigError(f"env.{name}", section[name], f"env.tasks.{name} decides")
+    rows = zip(*varied.values(), strict=True) if varied else [()]
+    return [dict(zip(varied, values, strict=True)) for values in rows]

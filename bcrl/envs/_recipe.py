@@ -1,13 +1,12 @@
 """How a simulator is made: a registered id, arguments, attributes and wrappers."""
 
-from __future__ import annotations
-
 import copy
-import importlib.util
 import inspect
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from contextlib import ExitStack
+from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium
@@ -48,9 +47,9 @@ class Recipe:
     """
 
     id: str
-    kwargs: Mapping[str, Any] = field(default_factory=dict)
-    attributes: Mapping[str, Any] = field(default_factory=dict)
-    wrappers: tuple[Any, ...] = ()
+    kwargs: dict[str, Any] | None = None
+    attributes: dict[str, Any] | None = None
+    wrappers: list[Any] | None = None
     observation: str | None = None
 
     def __hash__(self) -> int:
@@ -60,36 +59,28 @@ class Recipe:
         """A new environment without a time limit; ConfigError for a wrong key."""
         spec = spec_of(self.id)
         # A copy for each simulator: one that changes a list changes no other's.
-        kwargs: dict = copy.deepcopy(dict(self.kwargs))
-        attributes, wrappers = copy.deepcopy((self.attributes, self.wrappers))
+        kwargs, attributes = copy.deepcopy((self.kwargs or {}, self.attributes or {}))
         point = spec.entry_point
         creator = load_env_creator(point) if isinstance(point, str) else point
-        parameters = _parameters(creator)
-        _check_arguments("env.kwargs", kwargs, parameters)
-        mode = parameters.get("render_mode")
+        mode = _checked("env.kwargs", creator, kwargs).get("render_mode")
         if render_mode or (mode and mode.default is inspect.Parameter.empty):
             kwargs["render_mode"] = "rgb_array"
-        with warnings.catch_warnings():  # about precision and old versions
-            warnings.simplefilter("ignore", UserWarning)
-            env: gymnasium.Env = gymnasium.make(
-                spec, max_episode_steps=-1, disable_env_checker=True, **kwargs
-            )
-            try:
-                for key, value in attributes.items():
-                    _set_attribute(env, key, value)
-                for wrapper in wrappers:
-                    env = _wrapped(env, wrapper)
-            except BaseException:
-                env.close()
-                raise
+        kwargs |= {"max_episode_steps": -1, "disable_env_checker": True}
+        with warnings.catch_warnings(), ExitStack() as undone:
+            warnings.simplefilter("ignore", UserWarning)  # of precision, old versions
+            env: gymnasium.Env = gymnasium.make(spec, **kwargs)
+            undone.callback(env.close)
+            for key, value in attributes.items():
+                _set_attribute(env, key, value)
+            for wrapper in copy.deepcopy(self.wrappers or ()):
+                env = _wrapped(env, wrapper)
+            undone.pop_all()
         return env
 
     def mapping(self) -> Callable[[Any], Any] | None:
         """The function `observation`; ConfigError if it isn't trusted or missing."""
-        if self.observation is None:
-            return None
-        name = str(self.observation)
-        return plugins.attribute("env.observation", name, name)
+        name = self.observation
+        return plugins.attribute("env.observation", name, name) if name else None
 
 
 def spec_of(name: str) -> EnvSpec:
@@ -97,42 +88,32 @@ def spec_of(name: str) -> EnvSpec:
 
     `module:Name-v0` imports the module first: one of PACKAGES or of BCRL_TRUST.
     """
-    module, colon, name_there = name.rpartition(":")
-    if colon:
-        if module in PACKAGES and not importlib.util.find_spec(module):
-            why = f"the package {module} isn't installed: {_pip(module)}"
-            raise ConfigError("env.id", name, why)
+    module, _, plain = name.rpartition(":")
+    if module and (module not in PACKAGES or find_spec(module)):
         plugins.module("env.id", name, module, PACKAGES)
-    if name_there in gymnasium.registry:
-        return gymnasium.registry[name_there]
-    for module, beginnings in PACKAGES.items():
-        if name_there.startswith(beginnings):
-            missing = not importlib.util.find_spec(module)
-            first = f"{_pip(module)}, then " if missing else ""
-            why = f"{first}env.id={module}:{name_there} imports the package first"
+    if plain in gymnasium.registry:
+        return gymnasium.registry[plain]
+    for owner, begins in PACKAGES.items():
+        missing = find_spec(owner) is None
+        if missing if owner == module else plain.startswith(begins):
+            install = f"pip install {owner.replace('_', '-')}, then " if missing else ""
+            why = f"{install}env.id={owner}:{plain} imports the package first"
             raise ConfigError("env.id", name, why)
-    similar = closest(name_there, gymnasium.registry)
+    similar = closest(plain, gymnasium.registry)
     hint = f"did you mean env.id={similar}? " if similar else ""
     why = f"isn't registered; {hint}env.id=module:Name-v0 imports the module first"
     raise ConfigError("env.id", name, why)
 
 
-def _pip(module: str) -> str:
-    return f"pip install {module.replace('_', '-')}"
-
-
-def _parameters(creator: Any) -> dict[str, inspect.Parameter]:
+def _checked(
+    key: str, function: Any, arguments: Mapping[str, Any]
+) -> dict[str, inspect.Parameter]:
+    """A function's parameters; ConfigError for an argument unknown or set by bcrl."""
     try:
-        return dict(inspect.signature(creator).parameters)
+        parameters = dict(inspect.signature(function).parameters)
     except (TypeError, ValueError):  # it has no readable signature
-        return {"any": inspect.Parameter("any", inspect.Parameter.VAR_KEYWORD)}
-
-
-def _check_arguments(
-    key: str, arguments: Mapping[str, Any], parameters: dict[str, inspect.Parameter]
-) -> None:
-    """Raise ConfigError for a keyword that is unknown or that bcrl sets."""
-    known = [name for name in parameters if name not in _RESERVED]
+        return {}
+    known = [name for name in parameters if name not in (*_RESERVED, "env")]
     anything = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
     for name, value in arguments.items():
         if name in _RESERVED or (name == "render_mode" and value != "rgb_array"):
@@ -141,29 +122,24 @@ def _check_arguments(
         if name not in known and not anything:
             why = did_you_mean(name, known) if known else "it takes no arguments"
             raise ConfigError(f"{key}.{name}", value, why)
+    return parameters
 
 
 def _set_attribute(env: gymnasium.Env, key: str, value: Any) -> None:
     """Set a plain attribute of the unwrapped environment that survives a reset."""
-    plain = (bool, int, float, str, list, tuple, np.ndarray, np.number)
     there, place = env.unwrapped, f"env.attributes.{key}"
-    known = [
-        name
-        for name in dir(there)
-        if not name.startswith("_")
-        and not isinstance(getattr(type(there), name, None), property)
-        and isinstance(getattr(there, name, None), plain)
-    ]
+    plain = (bool, int, float, str, list, tuple, np.ndarray, np.number)
+    members = inspect.getmembers_static(there, lambda member: isinstance(member, plain))
+    known = {name: member for name, member in members if not name.startswith("_")}
     if key not in known:
         raise ConfigError(place, value, did_you_mean(key, known))
-    before = getattr(there, key)
+    before = known[key]
     old, new = np.asarray(before), np.asarray(value)
-    numbers = [array.dtype.kind in "iuf" for array in (old, new)]
-    alike = all(numbers) or old.dtype.kind == new.dtype.kind != "O"
+    alike = old.dtype.kind == new.dtype.kind != "O"
+    if {old.dtype.kind, new.dtype.kind} <= set("iuf"):
+        alike = bool(np.isfinite(new).all())
     if not alike or old.shape != new.shape:
-        raise ConfigError(place, value, f"must be like {before!r}")
-    if all(numbers) and not np.isfinite(new).all():
-        raise ConfigError(place, value, "must be finite")
+        raise ConfigError(place, value, f"must be like {before!r}, and finite")
     if isinstance(before, np.ndarray):
         value = new.astype(old.dtype)
     elif isinstance(before, float):
@@ -180,7 +156,6 @@ def _wrapped(env: gymnasium.Env, wrapper: Any) -> gymnasium.Env:
     if not isinstance(wrapper, dict) or not isinstance(wrapper.get("name"), str):
         why = "every wrapper needs a name: {name: RescaleObservation, min_obs: -1}"
         raise ConfigError("env.wrappers", wrapper, why)
-    arguments = {k: v for k, v in wrapper.items() if k != "name"}
     name = wrapper["name"].removeprefix("gymnasium.wrappers.")
     if "." in name:
         foreign = PACKAGES.keys() - {"bcrl", "gymnasium"}
@@ -192,12 +167,11 @@ def _wrapped(env: gymnasium.Env, wrapper: Any) -> gymnasium.Env:
     else:
         why = f"{did_you_mean(name, WRAPPERS)}, or module.Wrapper from a package"
         raise ConfigError("env.wrappers", name, why)
-    place = f"env.wrappers.{name}"
-    _, *parameters = _parameters(cls).items()  # the first one is env
-    _check_arguments(place, arguments, dict(parameters))
-    tuples = {k: tuple(v) if type(v) is list else v for k, v in arguments.items()}
+    items = ((k, tuple(v) if type(v) is list else v) for k, v in wrapper.items())
+    given, place = {k: v for k, v in items if k != "name"}, f"env.wrappers.{name}"
+    _checked(place, cls, given)
     try:
-        return cls(env, **tuples)
+        return cls(env, **given)
     except Exception as error:  # of a wrapper's code
         why = f"the wrapper failed: {type(error).__name__}: {error}"
-        raise ConfigError(place, arguments, why) from error
+        raise ConfigError(place, given, why) from error

@@ -1,11 +1,9 @@
 """The environment protocol: pure functions on arrays, no state or randomness inside."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from numbers import Integral
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeGuard, cast
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +14,8 @@ from bcrl.errors import ConfigError
 Floats = NDArray[np.float64]
 Ints = NDArray[np.integer]
 Bools = NDArray[np.bool_]
-Step = tuple[
-    Floats, Floats, Bools
-]  # next state (..., d), reward (...), absorbing (...)
+#: Next state (..., d), reward (...), absorbing (...).
+Step = tuple[Floats, Floats, Bools]
 
 #: Rules by which an episode counts as solved: docs/reference/gymnasium.md.
 RULES = ("absorbed", "survived", "unpunished", "rewarded", "threshold", "info")
@@ -85,26 +82,36 @@ class FiniteEnv(Env, Protocol):
         """Row of each state (..., d) in `states()`."""
 
 
-class Lanes(Protocol):
-    """Episodes of one environment side by side, one per lane; any leading axes."""
+@storable
+@dataclass(eq=False)
+class Lanes:
+    """Episodes of one environment side by side, one per lane; any leading axes.
 
-    @property
-    def failures(self) -> dict[int, str]:
-        """Why a lane's simulator failed, by the lane's number in C order.
+    These are lanes of a pure environment, whose states the caller keeps.
+    """
 
-        Such a lane gives zeros and is cut at every step; other lanes are not affected.
-        """
+    env: Any
+    #: Why a lane's simulator failed, by the lane's number in C order. Such a lane gives
+    #: zeros and is cut at every step; other lanes are not affected.
+    failures: dict[int, str] = field(default_factory=dict)
 
     def begin(self, start: Floats) -> Floats:
         """Observations (..., d) of lanes that start as `initial` says."""
+        return start
 
     def step(
         self, state: Floats, action: NDArray, noise: Floats, lanes: Any = ...
     ) -> tuple[NDArray, NDArray, NDArray, NDArray | bool]:
-        """`Env.step` in the chosen lanes, and where an episode is cut."""
+        """Next states, rewards and ends in the chosen lanes, and which are cut.
+
+        Actions (...) are for the environment's `step`, forces (..., k) for its `push`.
+        """
+        step = self.env.push if action.ndim == state.ndim else self.env.step
+        return *step(state, action, noise), False
 
     def restart(self, over: Bools, start: Floats, state: Floats) -> Floats:
         """All states; lanes that are over begin again from `start`."""
+        return np.where(over[..., None], start, state)
 
     def close(self) -> None:
         """Free the lanes' resources; the lanes end here."""
@@ -126,34 +133,6 @@ class SimulatedEnv(Env, Protocol):
         """Raise ConfigError for tasks that are alike or not reproducible."""
 
 
-@storable
-@dataclass(frozen=True)
-class PureLanes:
-    """Lanes of an environment whose steps are pure functions of the caller's states."""
-
-    env: Env
-    failures: ClassVar[dict[int, str]] = {}
-
-    def begin(self, start: Floats) -> Floats:
-        """The start states themselves."""
-        return start
-
-    def step(
-        self, state: Floats, action: NDArray, noise: Floats, lanes: Any = ...
-    ) -> tuple[NDArray, NDArray, NDArray, NDArray | bool]:
-        """`step` for actions (...), `push` for forces (..., k); never cut."""
-        forces = action.ndim == state.ndim
-        step = cast(ContinuousEnv, self.env).push if forces else self.env.step
-        return *step(state, action, noise), False
-
-    def restart(self, over: Bools, start: Floats, state: Floats) -> Floats:
-        """The start states where it is over."""
-        return np.where(over[..., None], start, state)
-
-    def close(self) -> None:
-        """Nothing to free."""
-
-
 def is_simulated(env: Env) -> TypeGuard[SimulatedEnv]:
     """Whether `env` is a SimulatedEnv."""
     return hasattr(env, "lanes")
@@ -166,7 +145,7 @@ def is_finite(env: Env) -> TypeGuard[FiniteEnv]:
 
 def lanes_of(env: Env) -> Lanes:
     """Lanes in which episodes of `env` can run side by side."""
-    return env.lanes() if is_simulated(env) else PureLanes(env)
+    return env.lanes() if is_simulated(env) else Lanes(env)
 
 
 def check_episodes(gamma: float, horizon: int) -> None:

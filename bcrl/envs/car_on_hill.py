@@ -1,16 +1,13 @@
 """The under-powered car that must rock its way up a hill (paper, §6.1 and C.1)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bcrl.common.compiling import kept
-from bcrl.envs.base import Floats, Ints, Step, check_episodes
+from bcrl.envs.base import Bools, Floats, Ints, Step, check_episodes
 from bcrl.errors import ConfigError
 
 FORCE = 4.0  # N, to the left (action 0) or to the right (action 1)
@@ -79,16 +76,11 @@ class CarOnHill:
 
     def step(self, state: Floats, action: Ints, noise: Floats | None = None) -> Step:
         """Hold a force for 0.1 s; IndexError for an action other than 0 and 1."""
-        state, action = np.asarray(state, np.float64), np.asarray(action)
-        shape = state.shape[:-1]
-        if action.shape != shape:
-            shape = np.broadcast_shapes(shape, action.shape)
-            state = np.broadcast_to(state, (*shape, 2))
-            action = np.broadcast_to(action, shape)
-        flat = np.ascontiguousarray(state).reshape(-1, 2)
-        force = np.ascontiguousarray(action, dtype=np.int64).reshape(-1)
-        after, reward, absorbing = _steps(flat, force, self.mass)
-        after = after.reshape(*shape, 2)
+        state, action = np.asarray(state, np.float64), np.asarray(action, np.int64)
+        shape = np.broadcast_shapes(state.shape[:-1], action.shape)
+        after = np.array(np.broadcast_to(state, (*shape, 2)), order="C")
+        action = np.array(np.broadcast_to(action, shape), order="C")
+        reward, absorbing = _step(after.reshape(-1, 2), action.reshape(-1), self.mass)
         return after, reward.reshape(shape), absorbing.reshape(shape)
 
     def evaluation_states(self) -> Floats:
@@ -220,21 +212,19 @@ def _outcome(p: float, v: float) -> float:
 
 
 @kept(nogil=True, error_model="numpy")
-def _steps(state: Floats, action: NDArray[np.int64], mass: float) -> Step:
-    """`CarOnHill.step` on states (n, 2) and actions (n,), lane by lane."""
-    after = np.empty_like(state)
-    reward = np.zeros(len(state))
-    absorbing = np.ones(len(state), dtype=np.bool_)
+def _step(state: Floats, action: Ints, mass: float) -> tuple[Floats, Bools]:
+    """Replace states (n, 2) by the next ones; give rewards and whether absorbing."""
+    reward, absorbing = np.zeros(len(state)), np.ones(len(state), np.bool_)
     for i in range(len(state)):
         p, v = state[i]
         if action[i] != 0 and action[i] != 1:
             raise IndexError("car_on_hill has the actions 0 (left) and 1 (right)")
         if _outcome(p, v) == 0.0:
             p, v = _advance(p, v, (FORCE if action[i] == 1 else -FORCE) / mass)
+            state[i, 0], state[i, 1] = p, v
             reward[i] = _outcome(p, v)
             absorbing[i] = reward[i] != 0.0
-        after[i, 0], after[i, 1] = p, v
-    return after, reward, absorbing
+    return reward, absorbing
 
 
 ENV = CarOnHill

@@ -4,14 +4,10 @@ Here are the checks that pure environments and simulators share, and the trial o
 user's pure environment. `gymnasium.py` has the trial of a simulator.
 """
 
-from __future__ import annotations
-
-import copy
 import functools
 import sys
 import traceback
 from collections.abc import Hashable, Sequence
-from itertools import pairwise
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -31,8 +27,7 @@ LEVELS = 10_000  # a component with more distinct values is fine enough
 _LANES = (16, 4)  # leading axes of the states in a pure environment's trial
 _STEPS = 200  # of each of these episodes
 #: Numbers that an environment needs, and the least value of each.
-_NUMBERS = {"n_actions": 1, "state_dim": 1, "horizon": 1, "gamma": 0}
-_NUMBERS |= {"initial_noise": 0, "step_noise": 0}
+_NUMBERS = {"n_actions": 1, "state_dim": 1, "initial_noise": 0, "step_noise": 0}
 _LIBRARIES = ("bcrl", "gymnasium", "numpy")  # no place of an error in foreign code
 
 #: Print a note, once per process.
@@ -47,174 +42,140 @@ def described(error: BaseException) -> str:
     ours = {Path(module.__file__ or "").parent for module in loaded}
     foreign = [f for f in files if not ours & {*Path(f.filename).parents}]
     frame = (foreign or files)[-1]
-    first_line = (str(error).strip().splitlines() or [""])[0][:200]
+    first_line = str(error).strip().partition("\n")[0][:200]
     place = f"…/{Path(frame.filename).name}:{frame.lineno}"
     return f"{type(error).__name__}: {first_line} ({place})"
 
 
-def note_resolution(key: str, found: Sequence[str], remedy: str) -> None:
-    """Print a note about the components that `unresolved` has `found`, if any."""
-    if found:
-        more = f" ({len(found) - 1} more like it)" if len(found) > 1 else ""
-        once(f"{key}: {found[0]}{more}; {remedy}")
-
-
-def unresolved(seen: Floats) -> list[str]:
-    """The components of states (n, d) whose values float32 or forests merge."""
+def unresolved(seen: Floats) -> str:
+    """The first component of states (n, d) whose values float32 or forests merge."""
     low, high = seen.min(0), seen.max(0)
     span, largest = high - low, np.maximum(np.abs(low), np.abs(high))
     fineness = np.maximum(np.spacing(largest.astype(np.float32)), RESOLUTION)
-    found = []
     for i in np.flatnonzero((span > 0) & (span < LEVELS * fineness)):
         steps = seen[:, i] - low[i]
         values = np.unique(np.round(steps / span[i] * 1e9))  # rounding errors merge
         if len(np.unique(np.round(steps / fineness[i]))) < len(values):
-            found.append(
-                f"component {i} of the observations lies within {low[i]:.10g} and "
-                f"{high[i]:.10g}, where float32 and forests resolve {fineness[i]:.2g}"
-            )
-    return found
+            where = f"component {i} of the observations lies within {low[i]:.10g} and "
+            where += f"{high[i]:.10g}, where float32 and forests resolve "
+            return f"{where}{fineness[i]:.2g}"
+    return ""
 
 
 def check_different(
-    tasks: Sequence[Any],
-    traces: Sequence[Sequence[Hashable]],
-    episodes: int,
-    allowed_by: str,
+    tasks: Sequence[Any], traces: Sequence[Sequence], episodes: int, allowed_by: str
 ) -> None:
-    """Raise ConfigError if successive tasks with equal traces should differ.
-
-    `traces` has one value per step for each task, equal if nothing differs in it.
-    """
-    for number, (one, other) in enumerate(pairwise(tasks), start=1):
+    """Raise ConfigError if successive tasks have equal traces, one value per step."""
+    for number in range(1, len(tasks)):
+        one, other = tasks[number - 1 : number + 1]
         same = (one.horizon, one.gamma) == (other.horizon, other.gamma)
-        pairs = zip(traces[number - 1], traces[number], strict=False)
+        pairs: Any = zip(traces[number - 1], traces[number], strict=False)
         if same and all(a == b for a, b in pairs):
+            changes = [
+                f"{name}: {getattr(one, name)} → {getattr(other, name)}"
+                for name in getattr(one, "__dataclass_fields__", ())
+                if getattr(one, name) != getattr(other, name)
+            ]
             why = f"tasks {number} and {number + 1} behave alike in {episodes} "
             why += "episodes of random play, so the parameter may have no effect "
             why += f"({allowed_by} accepts such tasks)"
-            raise ConfigError("env.tasks", _difference(one, other), why)
-
-
-def _difference(one: Any, other: Any) -> str:
-    """The constants in which two tasks differ."""
-    names = getattr(one, "__dataclass_fields__", ())
-    pairs = [(name, getattr(one, name), getattr(other, name)) for name in names]
-    changes = [f"{name}: {a} → {b}" for name, a, b in pairs if a != b]
-    return ", ".join(changes) or "the same task twice"
+            value = ", ".join(changes) or "the same task twice"
+            raise ConfigError("env.tasks", value, why)
 
 
 def check_pure_tasks(name: str, tasks: Sequence[Env]) -> None:
     """Try a user's tasks; ConfigError for a broken contract or for equal tasks."""
     traces = []
     for task in tasks:
-        trial = _Trial(name, task)
-        trial.play()
-        states = np.concatenate([s.reshape(-1, task.state_dim) for s in trial.states])
-        found = unresolved(states)
-        note_resolution(f"env.name={name}", found, "let step and initial rescale it")
-        traces.append(trial.trace)
+        try:
+            trace, states = _trial(task)
+        except ConfigError:
+            raise
+        except (Exception, SystemExit) as error:
+            broken = isinstance(error, _Broken)
+            why = str(error) if broken else f"random play failed: {described(error)}"
+            raise ConfigError("env.name", name, f"{why} (docs/howto/own.md)") from error
+        if note := unresolved(states):
+            once(f"env.name={name}: {note}; let step and initial rescale it")
+        traces.append(trace)
     if getattr(tasks[-1], "verify", True):
         allowed_by = f"verify = False in the class {type(tasks[-1]).__name__}"
         check_different(tasks, traces, int(np.prod(_LANES)), allowed_by)
 
 
-class _Trial:
-    """Random episodes in one pure environment, whose every answer is checked."""
+class _Broken(Exception):
+    """What an environment does against its contract."""
 
-    def __init__(self, name: str, env: Env) -> None:
-        self.name, self.env = name, env
-        self.states: list[Floats] = []
-        self.trace: list[Hashable] = []
 
-    def play(self) -> None:
-        """Call every method of the protocol; ConfigError for a broken contract."""
-        self._check_constants()
-        env, rng = self.env, np.random.default_rng(0)
-        noise = rng.random((*_LANES, env.initial_noise))
-        (state,) = self._answers("initial", noise, gives={"states": _LANES})
-        self._answers("evaluation_states", gives={"states": (None,)})
-        self.states, self.trace = [state], [state.tobytes()]
-        for _ in range(min(env.horizon, _STEPS)):
-            lanes = state.shape[:-1]
-            action = rng.integers(env.n_actions, size=lanes)
-            noise = rng.random((*lanes, env.step_noise))
-            gives = dict.fromkeys(("states", "rewards", "absorbing"), lanes)
-            found = self._answers("step", state, action, noise, gives=gives)
-            self.states.append(found[0])
-            self.trace.append(tuple(part.tobytes() for part in found))
-            state = found[0][~found[2]]
-            if not state.size:
-                break
+def _require(kept: bool | np.bool_, why: str) -> None:
+    if not kept:
+        raise _Broken(why)
 
-    def _wrong(self, why: str) -> ConfigError:
-        return ConfigError("env.name", self.name, f"{why} (docs/howto/own.md)")
 
-    def _check_constants(self) -> None:
-        env = self.env
-        for key, least in _NUMBERS.items():
-            value = getattr(env, key, None)
-            if not isinstance(value, Real if key == "gamma" else int) or value < least:
-                raise self._wrong(f"{key} is {value!r}, must be a number ≥ {least}")
-        check_episodes(env.gamma, env.horizon)
-        try:
-            hash(env)
-        except TypeError as error:
-            why = "it must be a frozen dataclass of constants, and "
-            raise self._wrong(f"{why}a tuple instead of a list ({error})") from error
-        rule = getattr(env, "success", "unpunished")
-        threshold = getattr(env, "success_threshold", None)
-        one_of("success", rule, [rule for rule in RULES if rule != "info"])
-        if rule == "threshold" and not isinstance(threshold, Real):
-            why = "must be the return that counts as solved"
-            raise self._wrong(f"success_threshold is {threshold!r}, {why}")
-
-    def _answers(
-        self, method: str, *arguments: NDArray, gives: dict[str, tuple[int | None, ...]]
-    ) -> list[NDArray]:
-        """The arrays that a method returns, the same ones for the same arguments.
-
-        `gives`: leading axes of each array by its noun; None stands for any length.
-        """
-        function = getattr(self.env, method)
-        before = [argument.copy() for argument in arguments]
-        try:
-            first = function(*arguments)
-            kept, again = copy.deepcopy(first), function(*arguments)
-        except (Exception, SystemExit) as error:
-            raise self._wrong(f"{method} failed: {described(error)}") from error
-        if not all(map(np.array_equal, arguments, before)):
-            raise self._wrong(f"{method} changes its arguments; it must copy them")
-        firsts, found, others = (
-            value if isinstance(value, tuple) else (value,)
-            for value in (first, kept, again)
+def _trial(env: Env) -> tuple[list[Hashable], Floats]:
+    """The trace of random episodes whose every answer is checked, and states (n, d)."""
+    for key, least in _NUMBERS.items():
+        value = getattr(env, key, None)
+        number = isinstance(value, int) and value >= least
+        _require(number, f"{key} is {value!r}, must be a number ≥ {least}")
+    check_episodes(env.gamma, env.horizon)
+    rule = getattr(env, "success", "unpunished")
+    one_of("success", rule, [rule for rule in RULES if rule != "info"])
+    threshold = getattr(env, "success_threshold", None)
+    why = f"success_threshold is {threshold!r}, must be the return of a solved episode"
+    _require(rule != "threshold" or isinstance(threshold, Real), why)
+    try:
+        hash(env)
+    except TypeError as error:
+        why = (
+            "it must be a frozen dataclass of constants, and a tuple instead of a list"
         )
-        if not len(found) == len(others) == len(gives):
-            why = f"must give {', '.join(gives)} as a tuple"
-            raise self._wrong(f"{method} gives {len(found)} values; it {why}")
-        for noun, one, other, raw in zip(gives, found, others, firsts, strict=True):
-            self._check_array(f"{method}: {noun}", one, gives[noun])
-            if not np.array_equal(one, other):
-                why = "must depend on its arguments only; randomness comes in as noise"
-                raise self._wrong(f"{method} gives other {noun} the second time; {why}")
-            if raw is other and getattr(raw, "flags", None) and raw.flags.writeable:
-                why = "gives one array again and again; it must make new ones"
-                raise self._wrong(f"{method} {why}")
-        dtypes = [bool if noun == "absorbing" else float for noun in gives]
-        return [np.asarray(x, kind) for x, kind in zip(found, dtypes, strict=True)]
+        raise _Broken(f"{why} ({error})") from error
+    rng = np.random.default_rng(0)
+    (state,) = _answers(env, "initial", rng.random((*_LANES, env.initial_noise)))
+    _answers(env, "evaluation_states")
+    states = [state]
+    trace: list[Hashable] = [state.tobytes()]
+    for _ in range(min(env.horizon, _STEPS)):
+        lanes = state.shape[:-1]
+        action = rng.integers(env.n_actions, size=lanes)
+        found = _answers(
+            env, "step", state, action, rng.random((*lanes, env.step_noise))
+        )
+        states.append(found[0])
+        trace.append(tuple(part.tobytes() for part in found))
+        state = found[0][~found[2]]
+        if not state.size:
+            break
+    return trace, np.concatenate([s.reshape(-1, env.state_dim) for s in states])
 
-    def _check_array(self, what: str, value: Any, lanes: tuple) -> None:
-        """Raise unless it is a finite array (lanes, …) of the right type."""
-        shape = getattr(value, "shape", None)
-        expected = (*lanes, self.env.state_dim) if what.endswith("states") else lanes
-        if lanes == (None,) and shape and shape[0]:
-            expected = (shape[0], *expected[1:])
-        if shape != expected:
-            raise self._wrong(f"{what} have shape {shape}, expected {expected}")
-        boolean = what.endswith("absorbing")
-        if getattr(value.dtype, "kind", "?") not in ("b" if boolean else "fiu"):
-            noun = "booleans" if boolean else "numbers"
-            raise self._wrong(f"{what} must be {noun}, are {value.dtype}")
-        if not (np.abs(value) <= LARGEST).all():
-            why = f"must be finite and at most {LARGEST:.3g} (float32's largest number)"
-            raise self._wrong(f"{what} {why}")
+
+def _answers(env: Env, method: str, *arguments: NDArray) -> list[NDArray]:
+    """The arrays that a method returns, the same ones for the same arguments."""
+    before = [argument.copy() for argument in arguments]
+    one, other = (getattr(env, method)(*arguments) for _ in range(2))
+    same = all(map(np.array_equal, arguments, before))
+    _require(same, f"{method} changes its arguments; it must copy them")
+    nouns = ("states", "rewards", "absorbing") if method == "step" else ("states",)
+    firsts, seconds = (x if isinstance(x, tuple) else (x,) for x in (one, other))
+    why = f"{method} gives {len(firsts)} values; it must give {', '.join(nouns)}"
+    _require(len(firsts) == len(seconds) == len(nouns), why)
+    found = []
+    for noun, first, second in zip(nouns, firsts, seconds, strict=True):
+        shape, dtype = getattr(first, "shape", None), getattr(first, "dtype", None)
+        lanes = arguments[0].shape[:-1] if arguments else (shape or (1,))[:1]
+        expected = (*lanes, env.state_dim) if noun == "states" else lanes
+        kinds, words = ("b", "booleans") if noun == "absorbing" else ("fiu", "numbers")
+        why = f"{method}: {noun} have shape {shape} and type {dtype}, "
+        why += f"expected {words} of shape {expected}"
+        _require(shape == expected and getattr(dtype, "kind", "?") in kinds, why)
+        _require(0 not in expected, f"{method}: there are no {noun}")
+        why = f"{method}: {noun} must be finite and at most {LARGEST:.3g} (float32)"
+        _require((np.abs(first) <= LARGEST).all(), why)
+        why = f"{method} gives other {noun} the second time; it must depend on its "
+        why += "arguments only: randomness comes in as noise"
+        _require(np.array_equal(first, second), why)
+        why = f"{method} gives one array again and again; it must make new ones"
+        _require(first is not second or not first.flags.writeable, why)
+        found.append(np.asarray(first, bool if noun == "absorbing" else float))
+    return found

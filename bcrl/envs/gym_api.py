@@ -1,7 +1,5 @@
 """Our environments behind Gymnasium's interface."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium
@@ -10,7 +8,6 @@ from gymnasium.spaces import Box, Discrete
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
 
 from bcrl.common.checks import construct
 from bcrl.envs import Env, env_class
@@ -48,8 +45,8 @@ class GymEnv(gymnasium.Env):
         self._path: list[Floats] = []  # the episode's states
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Floats, dict[str, Any]]:
+        self, *, seed: int | None = None, options: Any = None
+    ) -> tuple[Any, dict]:
         """A start state; with a `seed`, the same one each time."""
         super().reset(seed=seed)
         noise = self.np_random.random(self.task.initial_noise)
@@ -70,30 +67,28 @@ class GymEnv(gymnasium.Env):
         """A picture of the episode so far, (400, 400, 3); None without a mode."""
         if self.render_mode is None:
             return None
-        step = len(self._path) - 1
-        return draw(self.task, np.stack(self._path), caption=f"step {step}")
+        caption = f"step {len(self._path) - 1}"
+        return draw(self.task, np.stack(self._path), caption=caption)
 
 
 class GymVectorEnv(VectorEnv):
     """`num_envs` episodes of one task side by side, each step one call on arrays.
 
     Draws the same numbers as a SyncVectorEnv of `GymEnv`s: each episode has its own
-    generator, and the step after its last one resets it. Pictures show the present
-    states only.
+    generator, and the step after its last one resets it. Draws no pictures.
     """
 
-    metadata = GymEnv.metadata | {"autoreset_mode": AutoresetMode.NEXT_STEP}
+    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(
         self,
         env: Env | str,
         num_envs: int = 1,
         max_episode_steps: int | None = None,
-        render_mode: str | None = None,
         **constants: Any,
     ) -> None:
-        one = GymEnv(env, render_mode, **constants)
-        self.task, self.render_mode, self.num_envs = one.task, render_mode, num_envs
+        one = GymEnv(env, **constants)
+        self.task, self.num_envs = one.task, num_envs
         self.single_observation_space = one.observation_space
         self.single_action_space = one.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -104,16 +99,11 @@ class GymVectorEnv(VectorEnv):
         self._steps = np.zeros(num_envs, np.intp)
         self._over = np.zeros(num_envs, bool)
 
-    def reset(
-        self,
-        *,
-        seed: int | list[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> tuple[Floats, dict[str, Any]]:
-        """Start states (num_envs, d)."""
-        if not isinstance(seed, list):
-            seed = [seed if seed is None else seed + i for i in range(self.num_envs)]
-        for i, own in enumerate(seed):
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Floats, dict]:
+        """Start states (num_envs, d); `seed` is a number, a list of them, or None."""
+        if isinstance(seed, (int, np.integer)):
+            seed = [seed + i for i in range(self.num_envs)]
+        for i, own in enumerate(seed or ()):
             if own is not None:
                 self._rngs[i], _ = seeding.np_random(own)
         self._begin(np.ones(self.num_envs, bool))
@@ -136,13 +126,6 @@ class GymVectorEnv(VectorEnv):
         info = success if lanes.any() else {}
         return self._state.copy(), reward, terminated, truncated, info
 
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """A picture of each episode's present state."""
-        if self.render_mode is None:
-            return None
-        now = zip(self._state[:, None], self._steps, strict=True)
-        return tuple(draw(self.task, s, caption=f"step {t}") for s, t in now)
-
     def _begin(self, lanes: Bools) -> None:
         noise = self._noise(lanes, self.task.initial_noise)
         self._state[lanes], self._steps[lanes] = self.task.initial(noise), 0
@@ -163,7 +146,7 @@ def _task(env: Env | str, constants: dict[str, Any]) -> Env:
     if "horizon" in constants:
         why = "pass max_episode_steps instead: Gymnasium cuts episodes"
         raise ConfigError("env.horizon", constants["horizon"], why)
-    for key, value in constants.items():
-        if isinstance(value, np.generic):  # an entry of an array
-            constants[key] = value.item()
-    return construct("env", env_class(env), constants)
+    plain = {
+        k: v.item() if isinstance(v, np.generic) else v for k, v in constants.items()
+    }
+    return construct("env", env_class(env), plain)

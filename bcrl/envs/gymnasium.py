@@ -1,12 +1,11 @@
 """Any Gymnasium environment whose observations are vectors and actions Discrete."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,35 +15,30 @@ from numpy.typing import NDArray
 from bcrl.common.checks import one_of
 from bcrl.envs._recipe import Recipe, spec_of
 from bcrl.envs.base import RULES, Floats, Ints, check_episodes
-from bcrl.envs.checks import (
-    check_different,
-    described,
-    note_resolution,
-    once,
-    unresolved,
-)
-from bcrl.envs.simulators import (
-    SimulatedLanes,
-    Simulator,
-    is_plain,
-    reset_seed,
-    shortened,
-)
+from bcrl.envs.checks import check_different, described, once, unresolved
+from bcrl.envs.simulators import SimulatedLanes, Simulator, vectors
 from bcrl.errors import BcrlError, ConfigError, at_least
 
 _TRIES = 5  # random episodes that are played in every task before any work,
 _STEPS = 10_000  # with so many steps altogether
 _SECONDS = 5.0  # and for so long
 _KEPT = 4_000_000  # numbers of their observations, to see how fine they are
-_MOST_ACTIONS = 2**15 - 1  # kept as int16
-_RESCALE = (
-    "rescale: env.wrappers=[{name: RescaleObservation, min_obs: -1, max_obs: 1}] "
-    "where the Box has bounds, else env.observation=module.function"
-)
 
 
 @dataclass(frozen=True)
-class Gymnasium:
+class Trial:
+    """What a simulator's spaces and random episodes have shown."""
+
+    n_actions: int
+    state_dim: int
+    trace: list[tuple]  # per step, a digest of each episode
+    fresh: bool  # whether episodes repeat themselves in new simulators only
+    notes: list[str]  # about answers that were converted, and components too fine
+    success: str  # the rule that `auto` chooses
+
+
+@dataclass(frozen=True)
+class Gymnasium(Recipe):
     """A task of `gymnasium.make(id, **kwargs)`, changed by attributes and wrappers.
 
     | | |
@@ -63,11 +57,6 @@ class Gymnasium:
     when they are repeated. Raises BcrlError for a wrong field or a broken simulator.
     """  # noqa: E501
 
-    id: str
-    kwargs: dict[str, Any] | None = None
-    attributes: dict[str, Any] | None = None
-    wrappers: list[Any] | None = None
-    observation: str | None = None
     gamma: float = 0.99
     horizon: int | None = None
     success: str = "auto"
@@ -79,63 +68,53 @@ class Gymnasium:
     name: ClassVar[str] = "gymnasium"
     initial_noise: ClassVar[int] = 1  # the seed of a reset
     step_noise: ClassVar[int] = 0
-    # Every task gets its own values of these from its random episodes.
-    trial: ClassVar[Trial]
+    trial: ClassVar[Trial]  # Every task gets its own value of these.
     n_actions: ClassVar[int]
     state_dim: ClassVar[int]
-    fresh: ClassVar[bool]  # whether every episode needs a new simulator
+
+    __hash__ = Recipe.__hash__
 
     def __post_init__(self) -> None:
         at_least("env.starts", self.starts, 1)
         spec = spec_of(self.id)
-        horizon = self.horizon
-        if horizon is None and (horizon := spec.max_episode_steps) is None:
+        horizon = spec.max_episode_steps if self.horizon is None else self.horizon
+        if horizon is None:
             why = f"is needed: {self.id} is registered without a number of steps"
             raise ConfigError("env.horizon", None, why)
         check_episodes(self.gamma, horizon)
-        seen = trial(self.recipe, horizon, self.verify)
-        rule, threshold = self._success(spec.reward_threshold, seen)
+        recipe = Recipe(*(getattr(self, field.name) for field in fields(Recipe)))
+        seen = trial(recipe, horizon, self.verify)
+        rule, threshold = self._success(spec.reward_threshold, seen.success)
         derived = {"horizon": horizon, "success": rule, "success_threshold": threshold}
         derived |= {"trial": seen, "n_actions": seen.n_actions}
-        derived |= {"state_dim": seen.state_dim, "fresh": seen.fresh}
-        for key, value in derived.items():
+        for key, value in (derived | {"state_dim": seen.state_dim}).items():
             object.__setattr__(self, key, value)
-        if (vectors := self.action_vectors) is not None:
-            lengths = {len(vector) for vector in vectors}
-            if len(vectors) != seen.n_actions or len(lengths) != 1 or 0 in lengths:
-                why = f"must be {seen.n_actions} vectors of one length, one per action"
-                raise ConfigError("env.action_vectors", vectors, why)
+        own = self.action_vectors
+        lengths = {1} if own is None else {len(vector) for vector in own}
+        number = seen.n_actions if own is None else len(own)
+        if number != seen.n_actions or len(lengths) != 1 or 0 in lengths:
+            why = f"must be {seen.n_actions} vectors of one length, one per action"
+            raise ConfigError("env.action_vectors", own, why)
 
     def _success(
-        self, registered: float | None, seen: Trial
+        self, registered: float | None, suits: str
     ) -> tuple[str, float | None]:
-        """The rule, chosen if it is `auto`, and the threshold of `threshold`."""
+        """The rule, `suits` if it is `auto`, and the threshold of `threshold`."""
         rule, threshold = self.success, self.success_threshold
         one_of("env.success", rule, (*RULES, "auto"))
+        if threshold is not None and rule not in ("auto", "threshold"):
+            why = f"has no effect with env.success={rule}; env.success=threshold"
+            raise ConfigError("env.success_threshold", threshold, why)
         if threshold is not None:
-            if rule not in ("auto", "threshold"):
-                why = f"has no effect with env.success={rule}; env.success=threshold"
-                raise ConfigError("env.success_threshold", threshold, why)
             return "threshold", float(threshold)
         if rule == "auto":
-            rule = default_success(seen.reports, seen.low, seen.high, registered)
+            rule = suits
             value = f" (a return of {registered})" if rule == "threshold" else ""
             once(f"env.id={self.id}: an episode is solved if env.success={rule}{value}")
-        if rule != "threshold":
-            return rule, None
-        if registered is None:
+        if rule == "threshold" and registered is None:
             why = f"is needed: {self.id} is registered without one (a return)"
             raise ConfigError("env.success_threshold", None, why)
-        return rule, float(registered)
-
-    def __hash__(self) -> int:
-        return hash((self.id, self.horizon, self.gamma))  # dicts have no hash
-
-    @property
-    def recipe(self) -> Recipe:
-        """How a simulator of this task is made."""
-        parts = self.kwargs or {}, self.attributes or {}, tuple(self.wrappers or ())
-        return Recipe(self.id, *parts, self.observation)
+        return rule, registered if rule == "threshold" else None
 
     @property
     def actions(self) -> Floats | None:
@@ -147,74 +126,47 @@ class Gymnasium:
         """The numbers that reset lanes: the noise (..., 1) itself."""
         return noise
 
+    def simulator(self, render_mode: str | None = None) -> Simulator:
+        """A new simulator of this task."""
+        return Simulator(self, self.state_dim, self.trial.fresh, render_mode)
+
     def lanes(self) -> SimulatedLanes:
         """Simulators side by side."""
         return SimulatedLanes(self)
 
     def evaluation_states(self) -> Floats:
         """Observations after `starts` resets, always the same ones, (starts, d)."""
-        simulator = Simulator(self.recipe, self.state_dim, self.fresh)
-        try:
+        with closing(self.simulator()) as simulator:
             numbers = (np.arange(self.starts) + 0.5) / self.starts
-            return np.array([simulator.reset(reset_seed(each)) for each in numbers])
-        finally:
-            simulator.close()
+            return np.array([simulator.reset(each) for each in numbers])
 
     def pictures(self, start: Floats, actions: Ints) -> Iterator[NDArray[np.uint8]]:
         """The environment's own pictures of an episode, one more than actions.
 
         BcrlError if it draws none.
         """
-        simulator = Simulator(self.recipe, self.state_dim, render_mode="rgb_array")
-        try:
-            simulator.reset(reset_seed(start[0]))
-            for action in [*actions.tolist(), None]:
-                picture: Any = simulator.env.render()
-                yield picture
-                if action is not None:
-                    simulator.step(action)
-        except Exception as error:  # of foreign code
-            hint = "it may need pip install 'boosted-curriculum-rl[rendering]'"
-            why = f"{self.id} draws no picture ({described(error)}); {hint}"
-            raise BcrlError(why) from error
-        finally:
-            simulator.close()
+        with closing(self.simulator("rgb_array")) as simulator:
+            try:
+                simulator.reset(start[0])
+                for action in [*actions.tolist(), None]:
+                    picture: Any = simulator.env.render()
+                    yield picture
+                    if action is not None:
+                        simulator.step(action)
+            except Exception as error:  # of foreign code
+                hint = "it may need pip install 'boosted-curriculum-rl[rendering]'"
+                why = f"{self.id} draws no picture ({described(error)}); {hint}"
+                raise BcrlError(why) from error
 
     @staticmethod
-    def check_tasks(tasks: Sequence[Gymnasium]) -> None:
-        """Raise ConfigError for tasks that are alike or not reproducible.
-
-        Notes name answers that were converted, and components too fine for float32.
-        """
+    def check_tasks(tasks: Sequence["Gymnasium"]) -> None:
+        """Raise ConfigError for tasks that are alike; print their notes."""
         for task in tasks:
-            seen, key = task.trial, f"env.id={task.id}"
-            if seen.unsteady:
-                why = f"{seen.unsteady} differs after the same reset and actions; "
-                why += "expected the same each time: randomness from reset(seed=…) "
-                why += "only, no state that outlives a reset or that simulators share"
-                raise ConfigError("env.id", task.id, why)
-            if seen.adapted:
-                once(f"{key}: {'; '.join(seen.adapted)}")
-            note_resolution(key, seen.coarse, _RESCALE)
+            for note in task.trial.notes:
+                once(f"env.id={task.id}: {note}")
         if tasks[-1].verify:
             traces = [task.trial.trace for task in tasks]
             check_different(tasks, traces, _TRIES, "env.verify=false")
-
-
-@dataclass(frozen=True)
-class Trial:
-    """What a simulator's spaces and random episodes have shown."""
-
-    n_actions: int
-    state_dim: int
-    trace: list[tuple[int, ...]]  # per step, a digest of each episode
-    unsteady: str  # the step that differed when repeated; empty if none did
-    fresh: bool  # whether episodes repeat themselves in new simulators only
-    adapted: list[str]  # notes about answers that were converted
-    coarse: list[str]  # notes about components that float32 does not resolve
-    reports: bool  # whether info has a success key
-    low: float  # least and largest reward of the steps that did not terminate
-    high: float
 
 
 @functools.lru_cache(maxsize=256)
@@ -223,14 +175,13 @@ def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
 
     Raises BcrlError for the first answer that breaks Gymnasium's contract.
     """
-    first = Simulator(recipe)
-    simulators = [first]
-    trace: list[tuple[int, ...]] = []
+    simulators = [Simulator(recipe) for _ in range(_TRIES)]
+    first = simulators[0]
+    trace: list[tuple] = []
     seen: list[Floats] = []
     rewards: list[float] = []
     try:
-        n_actions = _checked_actions(first)
-        simulators += [Simulator(recipe) for _ in range(_TRIES - 1)]
+        n_actions = _n_actions(first)
         steps = min(horizon, _STEPS // _TRIES)
         actions = np.random.default_rng(0).integers(n_actions, size=(steps, _TRIES)).T
         played = map(_episode, simulators, itertools.count(), actions.tolist())
@@ -238,35 +189,36 @@ def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
         for outcomes in itertools.zip_longest(*played):
             running = [outcome for outcome in outcomes if outcome]
             if len(seen) * first.state_dim < _KEPT:
-                seen += [state for state, *_ in running]
+                seen += [state for _, state, *_ in running]
             if trace:
-                rewards += [reward for _, reward, ended, _ in running if not ended]
-            trace.append(tuple(map(_digest, outcomes)))
+                rewards += [reward for *_, reward, ended in running if not ended]
+            trace.append(tuple(outcome and outcome[0] for outcome in outcomes))
             if time.monotonic() > deadline:
                 break
     finally:
         for simulator in simulators:
             simulator.close()
-    adapted = []
+    notes = []
     if recipe.observation is None and not isinstance(first.space, spaces.Box):
-        note = f"observations, {shortened(first.space)}, are flattened to "
-        adapted.append(f"{note}{first.state_dim} numbers, as by FlattenObservation")
+        space = " ".join(str(first.space).split())[:90]
+        note = f"observations, {space}, are flattened to "
+        notes.append(f"{note}{first.state_dim} numbers, as by FlattenObservation")
     unsteady = _unsteady(recipe, actions, trace, False) if verify else ""
-    fresh = bool(unsteady) and not _unsteady(recipe, actions, trace, True)
-    if fresh:
-        adapted.append("a reset leaves something behind, so each episode has a new one")
-    return Trial(
-        n_actions,
-        first.state_dim,
-        trace,
-        "" if fresh else unsteady,
-        fresh,
-        adapted,
-        unresolved(np.array(seen)),
-        any(simulator.reports for simulator in simulators),
-        min(rewards, default=0.0),
-        max(rewards, default=0.0),
-    )
+    if unsteady and _unsteady(recipe, actions, trace, True):
+        why = f"{unsteady} differs after the same reset and actions; expected the same "
+        why += "each time: randomness from reset(seed=…) only, no state that outlives "
+        why += "a reset or that simulators share"
+        raise ConfigError("env.id", recipe.id, why)
+    if unsteady:
+        notes.append("a reset leaves something behind, so each episode has a new one")
+    if coarse := unresolved(np.array(seen)):
+        wrapper = "{name: RescaleObservation, min_obs: -1, max_obs: 1}"
+        where = "where the Box has bounds, else env.observation=module.function"
+        notes.append(f"{coarse}; rescale: env.wrappers=[{wrapper}] {where}")
+    reports = any(simulator.reports for simulator in simulators)
+    low, high = min(rewards, default=0.0), max(rewards, default=0.0)
+    rule = default_success(reports, low, high, spec_of(recipe.id).reward_threshold)
+    return Trial(n_actions, first.state_dim, trace, bool(unsteady), notes, rule)
 
 
 def default_success(
@@ -289,17 +241,13 @@ def default_success(
 
 
 def _episode(simulator: Simulator, number: int, actions: list[int]) -> Iterator[tuple]:
-    """Observation, reward, terminated, truncated after the reset and each step."""
-    yield simulator.reset(reset_seed((number + 0.5) / _TRIES)), 0.0, False, False
-    for action in actions:
-        state, reward, ended, cut, _ = simulator.step(action)
-        yield state, reward, ended, cut
-        if ended or cut:
+    """A digest, observation, reward and end after the reset and each step."""
+    outcome = simulator.reset((number + 0.5) / _TRIES), 0.0, False, False
+    for action in [*actions, None]:
+        yield hash((outcome[0].tobytes(), *outcome[1:])), *outcome[:3]
+        if action is None or any(outcome[2:]):  # terminated or truncated
             return
-
-
-def _digest(outcome: tuple | None) -> int:
-    return hash(outcome and (outcome[0].tobytes(), *outcome[1:]))
+        outcome = simulator.step(action)
 
 
 def _unsteady(recipe: Recipe, actions: NDArray, trace: list, fresh: bool) -> str:
@@ -308,47 +256,40 @@ def _unsteady(recipe: Recipe, actions: NDArray, trace: list, fresh: bool) -> str
     So randomness without a seed is found, and state that outlives a reset or that
     simulators share. Empty if all episodes repeat themselves.
     """
-    simulator = Simulator(recipe, fresh=fresh)
-    try:
+    with closing(Simulator(recipe, fresh=fresh)) as simulator:
         for number, own in enumerate(actions.tolist()):
             played = _episode(simulator, number, own)
             for t, (outcome, expected) in enumerate(zip(played, trace, strict=False)):
-                if _digest(outcome) != expected[number]:
+                if outcome[0] != expected[number]:
                     return (
                         f"{f'step {t}' if t else 'the reset'} of episode {number + 1}"
                     )
-    finally:
-        simulator.close()
     return ""
 
 
-def _checked_actions(simulator: Simulator) -> int:
-    """The number of actions; BcrlError for spaces that can't be learned in."""
+def _n_actions(simulator: Simulator) -> int:
+    """The number of actions; ConfigError for spaces that can't be learned in."""
+    simulator.open()
     recipe, space, actions = simulator.recipe, simulator.space, simulator.actions
     if not isinstance(actions, spaces.Discrete):
-        why = f"has actions {actions}, only Discrete ones can be learned; "
-        box = isinstance(actions, spaces.Box)
-        hint = "env.wrappers=[{name: DiscretizeAction, bins: 5}]" if box else ""
-        raise ConfigError(
-            "env.id", recipe.id, why + (hint or "a wrapper can number them")
-        )
-    if not 1 <= actions.n <= _MOST_ACTIONS:
-        why = f"has {actions.n} actions, from 1 to {_MOST_ACTIONS} can be learned"
-        raise ConfigError("env.id", recipe.id, why)
-    if not isinstance(space, spaces.Space):
-        problem = f"is {space!r} of type {type(space).__name__}"
-        raise simulator.broken("observation_space", problem, "a space of gymnasium's")
-    if recipe.observation is None and not is_plain(space):
-        why = f"has observations {space}, which are no vector of a fixed length; "
-        if recipe.id.startswith("minigrid:"):
-            why += "env.wrappers=[{name: minigrid.wrappers.ImgObsWrapper}], or "
+        box = "env.wrappers=[{name: DiscretizeAction, bins: 5}]"
+        hint = box if isinstance(actions, spaces.Box) else "a wrapper can number them"
+        why = f"has actions {actions}, only Discrete ones can be learned; {hint}"
+    elif not isinstance(space, spaces.Space):
+        why = f"has the observation_space {space!r}, expected a space of gymnasium's"
+    elif recipe.observation is None and vectors(space) is None:
+        hints = ["env.observation=module.function makes an array of them"]
         if isinstance(space, spaces.Dict):
-            keys = ", ".join(str(k) for k, v in space.spaces.items() if is_plain(v))
-            wrapper = f"{{name: FilterObservation, filter_keys: [{keys}]}}"
-            why += f"env.wrappers=[{wrapper}], or "
-        why += "env.observation=module.function makes an array of them"
-        raise ConfigError("env.id", recipe.id, why)
-    return int(actions.n)
+            keys = [str(k) for k, part in space.items() if vectors(part) is not None]
+            wrapper = f"{{name: FilterObservation, filter_keys: [{', '.join(keys)}]}}"
+            hints.insert(0, f"env.wrappers=[{wrapper}]")
+        if recipe.id.startswith("minigrid:"):
+            hints.insert(0, "env.wrappers=[{name: minigrid.wrappers.ImgObsWrapper}]")
+        why = f"has observations {space}, which are no vector of a fixed length; "
+        why += ", or ".join(hints)
+    else:
+        return int(actions.n)
+    raise ConfigError("env.id", recipe.id, why)
 
 
 ENV = Gymnasium

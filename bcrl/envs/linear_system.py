@@ -1,18 +1,14 @@
 """A point mass under force control: an LQ task, and a narrow pathway with drift."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
-import numba
 import numpy as np
 
 from bcrl.common.arrays import ndtri, writable
+from bcrl.common.checks import one_of
 from bcrl.common.compiling import kept
 from bcrl.envs.base import Floats, Ints, Step, check_episodes
-from bcrl.errors import ConfigError, did_you_mean
 
 DT = 0.05  # s, Euler step
 NOISE = 1e-5  # standard deviation of the noise on each component of the derivative
@@ -27,25 +23,15 @@ ACTIONS = np.array(
     [[1, 0], [0, 1], [-1, 0], [0, -1]]
     + [[a * DIAGONAL, b * DIAGONAL] for a in (1, -1) for b in (1, -1)]
 )
-
-
-class Constants(NamedTuple):
-    """Constants that the presets set: dynamics, and half-widths of the start's box."""
-
-    gain: float
-    friction: float
-    spread: tuple[float, float, float, float]
-
-
-#: preset → task → constants (paper, C.3; released code)
+#: preset → task → gain, friction, half-widths of the start's box (C.3; released code)
 _PRESETS = {
     "released": {
-        "lq": Constants(2.0, 0.1, (0.3, 0.3, 0.3, 0.3)),
-        "target": Constants(2.0, 1.0, (1e-3, 0.1, 0.4, 0.1)),
+        "lq": (2.0, 0.1, (0.3, 0.3, 0.3, 0.3)),
+        "target": (2.0, 1.0, (1e-3, 0.1, 0.4, 0.1)),
     },
     "paper": {
-        "lq": Constants(1.0, 0.1, (0.0, 0.3, 0.0, 0.3)),
-        "target": Constants(1.0, 0.1, (0.0, 0.1, 0.4, 0.1)),
+        "lq": (1.0, 0.1, (0.0, 0.3, 0.0, 0.3)),
+        "target": (1.0, 0.1, (0.0, 0.1, 0.4, 0.1)),
     },
 }
 
@@ -84,15 +70,13 @@ class LinearSystem:
     positions: ClassVar[tuple[int, ...]] = (0, 2)
 
     def __post_init__(self) -> None:
-        for key, allowed in (("task", ("lq", "target")), ("preset", tuple(_PRESETS))):
-            value = getattr(self, key)
-            if value not in allowed:
-                raise ConfigError(f"env.{key}", value, did_you_mean(value, allowed))
+        one_of("env.task", self.task, ("lq", "target"))
+        one_of("env.preset", self.preset, _PRESETS)
         check_episodes(self.gamma, self.horizon)
 
     @property
-    def constants(self) -> Constants:
-        """Gain, friction and start box of this task in this preset."""
+    def constants(self) -> tuple[float, float, tuple[float, ...]]:
+        """Gain, friction and half-widths of the start box, by task and preset."""
         return _PRESETS[self.preset][self.task]
 
     @property
@@ -103,14 +87,14 @@ class LinearSystem:
         standard deviations sustain; the drift may lead beyond the walls by one step.
         """
         gain, friction, spread = self.constants
-        noise = 10.0 * NOISE
-        fast = [max(spread[i], (gain + noise) / friction) for i in (1, 3)]
-        if self.task == "lq":
-            high = np.array([np.inf, fast[0], np.inf, fast[1]])
-            return np.stack([-high, high])
-        beyond = DT * (abs(self.drift) + noise)
-        low = [WALLS[0] - beyond, -fast[0], -PATHWAY, -fast[1]]
-        return np.array([low, [WALLS[1] + beyond, fast[0], PATHWAY, fast[1]]])
+        fast = [max(spread[i], (gain + 10.0 * NOISE) / friction) for i in (1, 3)]
+        found = np.array([[-np.inf], [np.inf]]).repeat(4, 1)
+        found[:, [1, 3]] = np.array([[-1.0], [1.0]]) * fast
+        if self.task == "target":
+            beyond = DT * (abs(self.drift) + 10.0 * NOISE)
+            found[:, 0] = WALLS[0] - beyond, WALLS[1] + beyond
+            found[:, 2] = -PATHWAY, PATHWAY
+        return found
 
     @property
     def linear_quadratic(self) -> tuple[Floats, ...] | None:
@@ -118,22 +102,21 @@ class LinearSystem:
         if self.task != "lq":
             return None
         gain, friction, _ = self.constants
-        drift = np.kron(np.eye(2), np.array([[0.0, 1.0], [0.0, -friction]]))
-        push = np.kron(np.eye(2), np.array([[0.0], [gain]]))
-        a, b = np.eye(4) + DT * drift, DT * push
+        a = np.kron(np.eye(2), np.array([[1.0, DT], [0.0, 1.0 - DT * friction]]))
+        b = np.kron(np.eye(2), np.array([[0.0], [DT * gain]]))
         return a, b, np.diag(STATE_COST), ACTION_COST * np.eye(2)
 
-    @cached_property
-    def _dynamics(self) -> Floats:
-        """Gain, friction, drift, the walls' x and the start box, for compiled code."""
-        gain, friction, spread = self.constants
-        free = self.task == "lq"
-        rest = (0.0, -np.inf, np.inf) if free else (self.drift, *WALLS)
-        return np.array([gain, friction, *rest, *spread])
+    @property
+    def _dynamics(self) -> tuple[float, ...]:
+        """Gain, friction, drift and the walls' x."""
+        free = (0.0, -np.inf, np.inf)
+        return *self.constants[:2], *(
+            free if self.task == "lq" else (self.drift, *WALLS)
+        )
 
     def initial(self, noise: Floats) -> Floats:
         """Start states (..., 4): the box around (−4, 0, 0, 0), for noise (..., 4)."""
-        return _START + np.array(self.constants.spread) * (2.0 * noise - 1.0)
+        return _START + np.array(self.constants[2]) * (2.0 * noise - 1.0)
 
     def step(self, state: Floats, action: Ints, noise: Floats) -> Step:
         """One step with action (...), an index into `actions`."""
@@ -141,20 +124,16 @@ class LinearSystem:
 
     def push(self, state: Floats, force: Floats, noise: Floats) -> Step:
         """One step with any force (..., 2); the fresh start, if any, is in `noise`."""
-        rows = [_rows(x) for x in (state, force, ndtri(noise[..., :4]))]
-        lead = np.shape(state)[:-1]
-        if self.task == "target":
-            fresh = _rows(noise[..., 4:])
-            after, reward, arrived = _pathway(*rows, fresh, self._dynamics)
-        else:
-            after, reward = _lq(*rows, self._dynamics)
-            arrived = np.zeros(len(reward), bool)
+        rows = map(_rows, (state, force, ndtri(noise[..., :4]), noise))
+        lead, spread = np.shape(state)[:-1], self.constants[2]
+        lq = self.task == "lq"
+        after, reward, arrived = _push(*rows, self._dynamics, spread, lq)
         return after.reshape(*lead, 4), reward.reshape(lead), arrived.reshape(lead)
 
     def before_reset(self, state: Floats, action: Ints, noise: Floats) -> Floats:
         """Where `step` leads before a fresh start replaces it, (..., 4)."""
         arrays = (state, ACTIONS[action], ndtri(noise[..., :4]))
-        after = _move(*map(_rows, arrays), self._dynamics)
+        after = _moved(*map(_rows, arrays), self._dynamics)
         return after.reshape(np.shape(state))
 
     def evaluation_states(self) -> Floats:
@@ -162,20 +141,19 @@ class LinearSystem:
 
         The same in both tasks, so that FQI's curves are comparable between them.
         """
-        half = 0.5 * np.array(_PRESETS[self.preset]["target"].spread)
+        half = 0.5 * np.array(_PRESETS[self.preset]["target"][2])
         signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 4, indexing="ij"), -1)
         return _START + half * np.vstack([np.zeros((1, 4)), signs.reshape(-1, 4)])
 
-    def plane(self, side: int = 41, extent: float = 5.0) -> Floats:
-        """The x–y plane [−extent, extent]² at zero velocity, x-major, (side², 4)."""
-        axis = np.linspace(-extent, extent, side)
-        states = np.zeros((side, side, 4))
+    def plane(self) -> Floats:
+        """The x–y plane [−5, 5]² at zero velocity, x-major, (41², 4)."""
+        axis, states = np.linspace(-5.0, 5.0, 41), np.zeros((41, 41, 4))
         states[..., 0], states[..., 2] = np.meshgrid(axis, axis, indexing="ij")
         return states.reshape(-1, 4)
 
     def scene(self) -> dict[str, Floats]:
         """What a figure needs to draw the task: forces, pathway, goal, start, drift."""
-        at, half = _START[[0, 2]], np.array(self.constants.spread)[[0, 2]]
+        at, half = _START[[0, 2]], np.array(self.constants[2])[[0, 2]]
         return {
             "actions": ACTIONS,
             "pathway": np.array([WALLS[0], -PATHWAY, WALLS[1], PATHWAY]),
@@ -190,64 +168,53 @@ def _rows(array: Floats) -> Floats:
     return writable(array).reshape(-1, np.shape(array)[-1])
 
 
-@numba.njit
-def _moved(state: Any, force: Any, normal: Any, dynamics: Any) -> Any:
-    """The components (x, ẋ, y, ẏ) after one step: integrated, then reflected."""
-    x, x_dot, y, y_dot = state[0], state[1], state[2], state[3]
-    gain, friction, drift = dynamics[0], dynamics[1], dynamics[2]
-    low, high = dynamics[3], dynamics[4]
-    new_x = x + DT * (x_dot + drift + NOISE * normal[0])
-    new_x_dot = x_dot + DT * (gain * force[0] - friction * x_dot + NOISE * normal[1])
-    new_y = y + DT * (y_dot + NOISE * normal[2])
-    new_y_dot = y_dot + DT * (gain * force[1] - friction * y_dot + NOISE * normal[3])
-    if not (new_x < low or new_x > high):
-        return new_x, new_x_dot, new_y, new_y_dot
-    # A straight line to the contact, then without force and drift. Where the drift
-    # overcame the velocity, mirroring leads outside by a little: share 0.
-    span = 1.0 if new_x == x else new_x - x
-    share = ((low if new_x < low else high) - x) / span
-    share = 0.0 if share < 0.0 else 1.0 if share > 1.0 else share
-    rest = (1.0 - share) * DT
-    x_dot_there = -(x_dot + share * (new_x_dot - x_dot))
-    y_dot_there = y_dot + share * (new_y_dot - y_dot)
-    return (
-        x + share * (new_x - x) + rest * x_dot_there,
-        x_dot_there - rest * friction * x_dot_there,
-        y + share * (new_y - y) + rest * y_dot_there,
-        y_dot_there - rest * friction * y_dot_there,
-    )
-
-
 @kept(nogil=True)
-def _move(state: Any, force: Any, normal: Any, dynamics: Any) -> Any:
+def _moved(state: Any, force: Any, normal: Any, dynamics: Any) -> Any:
+    """States (n, 4) after one step: integrated, then reflected by the walls."""
     after = np.empty_like(state)
+    gain, friction, drift, low, high = dynamics
     for i in range(len(state)):
-        moved = _moved(state[i], force[i], normal[i], dynamics)
-        after[i, 0], after[i, 1], after[i, 2], after[i, 3] = moved
+        x, x_dot, y, y_dot = state[i]
+        push, z = force[i], normal[i]
+        new_x = x + DT * (x_dot + drift + NOISE * z[0])
+        new_x_dot = x_dot + DT * (gain * push[0] - friction * x_dot + NOISE * z[1])
+        new_y = y + DT * (y_dot + NOISE * z[2])
+        new_y_dot = y_dot + DT * (gain * push[1] - friction * y_dot + NOISE * z[3])
+        if new_x < low or new_x > high:
+            # A straight line to the contact, then without force and drift. Where the
+            # drift overcame the velocity, mirroring leads outside by a little: share 0.
+            span = 1.0 if new_x == x else new_x - x
+            share = ((low if new_x < low else high) - x) / span
+            share = 0.0 if share < 0.0 else 1.0 if share > 1.0 else share
+            rest = (1.0 - share) * DT
+            x_dot_there = -(x_dot + share * (new_x_dot - x_dot))
+            y_dot_there = y_dot + share * (new_y_dot - y_dot)
+            new_x = x + share * (new_x - x) + rest * x_dot_there
+            new_x_dot = x_dot_there - rest * friction * x_dot_there
+            new_y = y + share * (new_y - y) + rest * y_dot_there
+            new_y_dot = y_dot_there - rest * friction * y_dot_there
+        after[i, 0], after[i, 1] = new_x, new_x_dot
+        after[i, 2], after[i, 3] = new_y, new_y_dot
     return after
 
 
 @kept(nogil=True)
-def _lq(state: Any, force: Any, normal: Any, dynamics: Any) -> Any:
-    """The LQ task's next states and rewards."""
-    after, reward = _move(state, force, normal, dynamics), np.empty(len(state))
+def _push(
+    state: Any, force: Any, normal: Any, noise: Any, dynamics: Any, spread: Any, lq: Any
+) -> Any:
+    """Next states, rewards and ends; `noise` gives the target task's fresh starts."""
+    after, reward = _moved(state, force, normal, dynamics), np.empty(len(state))
+    arrived = np.zeros(len(state), np.bool_)
     for i in range(len(state)):
-        cost = ACTION_COST * (force[i, 0] * force[i, 0] + force[i, 1] * force[i, 1])
-        for k in range(4):
-            cost = cost + STATE_COST[k] * after[i, k] * after[i, k]
-        reward[i] = -cost
-    return after, reward
-
-
-@kept(nogil=True)
-def _pathway(state: Any, force: Any, normal: Any, uniform: Any, dynamics: Any) -> Any:
-    """The target task's next states, rewards and ends; `uniform` gives fresh starts."""
-    after, reward = _move(state, force, normal, dynamics), np.empty(len(state))
-    arrived = np.empty(len(state), np.bool_)
-    for i in range(len(state)):
+        if lq:
+            cost = ACTION_COST * (force[i, 0] * force[i, 0] + force[i, 1] * force[i, 1])
+            for k in range(4):
+                cost = cost + STATE_COST[k] * after[i, k] * after[i, k]
+            reward[i] = -cost
+            continue
         if after[i, 2] > PATHWAY or after[i, 2] < -PATHWAY:
             for k in range(4):  # as `initial`
-                after[i, k] = _START[k] + dynamics[5 + k] * (2.0 * uniform[i, k] - 1.0)
+                after[i, k] = _START[k] + spread[k] * (2.0 * noise[i, 4 + k] - 1.0)
         distance = after[i, 0] * after[i, 0] + after[i, 2] * after[i, 2]
         arrived[i] = distance < _GOAL_RADIUS * _GOAL_RADIUS
         reward[i] = 0.0 if arrived[i] else -1.0

@@ -1,15 +1,14 @@
 """The maze with two walls and an ever narrower passage (paper, §6.2 and C.2)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.common.checks import one_of
 from bcrl.envs.base import Bools, Floats, Ints, Step, check_episodes
-from bcrl.errors import ConfigError, did_you_mean
+from bcrl.errors import ConfigError
 
 SIDE = 21  # lattice points along each axis
 MOVE = 0.05  # length of a move, 1 / (SIDE - 1)
@@ -20,11 +19,11 @@ GOAL_REWARD = 5.0
 MOVES = MOVE * np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
 ROUNDING = 1e-9  # far below the lattice spacing, far above float error
 
-#: preset → wall half-width, is the goal's boundary inside, are positions on the lattice
+#: preset → wall half-width, bound of the goal's radius, are positions on the lattice
 PRESETS = {
-    "lattice": (0.05, True, True),
-    "paper": (0.025, False, True),
-    "released": (0.05, False, False),
+    "lattice": (0.05, GOAL_RADIUS + ROUNDING, True),
+    "paper": (0.025, GOAL_RADIUS - ROUNDING, True),
+    "released": (0.05, GOAL_RADIUS, False),
 }
 
 
@@ -63,14 +62,14 @@ class Maze:
     initial_noise: ClassVar[int] = 0
     step_noise: ClassVar[int] = 0
     actions: ClassVar[Floats] = MOVES
+    goal: ClassVar[Floats] = GOAL  # its centre, (2,)
+    bounds: ClassVar[Floats] = np.array([[0.0, 0.0], [1.0, 1.0]])  # of the states
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.height < 1.0:
             raise ConfigError("env.height", self.height, "must lie in [0, 1)")
+        one_of("env.preset", self.preset, PRESETS)
         check_episodes(self.gamma, self.horizon)
-        if self.preset not in PRESETS:
-            hint = did_you_mean(self.preset, PRESETS)
-            raise ConfigError("env.preset", self.preset, hint)
 
     @property
     def finite(self) -> bool:
@@ -84,16 +83,6 @@ class Maze:
         (a, b), h = WALL_X, self.height
         return np.array([[a - w, 0.0, a + w, h], [b - w, 1.0 - h, b + w, 1.0]])
 
-    @property
-    def bounds(self) -> Floats:
-        """The lowest and the highest coordinates, (2, 2)."""
-        return np.array([[0.0, 0.0], [1.0, 1.0]])
-
-    @property
-    def goal(self) -> Floats:
-        """Centre of the goal, shape (2,)."""
-        return GOAL
-
     def blocked(self, state: Floats) -> Bools:
         """Whether states (..., 2) lie strictly inside a wall, shape (...)."""
         half_width, _, on_lattice = PRESETS[self.preset]
@@ -105,11 +94,7 @@ class Maze:
 
     def is_goal(self, state: Floats) -> Bools:
         """Whether states (..., 2) lie at the goal, shape (...)."""
-        _, inclusive, on_lattice = PRESETS[self.preset]
-        distance = abs(state - GOAL).sum(-1)
-        if not on_lattice:
-            return distance < GOAL_RADIUS
-        return distance < GOAL_RADIUS + (ROUNDING if inclusive else -ROUNDING)
+        return abs(state - GOAL).sum(-1) < PRESETS[self.preset][1]
 
     def initial(self, noise: Floats) -> Floats:
         """The corner (0, 0) for noise of shape (..., 0)."""

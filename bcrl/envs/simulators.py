@@ -1,8 +1,7 @@
 """Simulators whose every answer is checked, one by one or side by side."""
 
-from __future__ import annotations
-
 import math
+import reprlib
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
@@ -16,88 +15,104 @@ from numpy.typing import NDArray
 
 from bcrl.common.serialization import DERIVED, storable
 from bcrl.common.signals import Interrupted
-from bcrl.envs._recipe import Recipe
-from bcrl.envs.base import Bools, Floats
+from bcrl.envs.base import Bools, Floats, Lanes
 from bcrl.envs.checks import LARGEST, described
 from bcrl.errors import BcrlError
 
 _SEEDS = 2**31  # resets take seeds below: every 32-bit generator accepts them
 _SUCCESS_KEYS = ("is_success", "success")  # of info
 #: Spaces whose members become a vector without loss.
-_PLAIN = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+_VECTORS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 #: Errors that end more than one simulator.
 _PASSING = (BcrlError, Interrupted, KeyboardInterrupt, GeneratorExit)
-
-#: Observation (d,), reward, terminated, truncated, and whether info reports success.
-_Outcome = tuple[Floats, float, bool, bool, bool]
 
 
 class BrokenSimulator(BcrlError):
     """A wrong answer of a simulator: names the method, the answer, what is expected."""
 
 
+@storable
+@dataclass(eq=False)
 class Simulator:
-    """A running environment; every wrong answer raises BrokenSimulator.
+    """One environment, made when it is needed; a wrong answer raises BrokenSimulator.
 
     `state_dim`: numbers in an observation; 0 takes those of the first one. `fresh`:
-    every episode needs a new environment. The environment is closed at the latest when
-    the simulator is deleted or the process exits.
+    every episode needs a new environment. An episode follows from the number that reset
+    it and the actions since. Only these are stored: a simulator that was closed, or is
+    from a checkpoint, plays them again.
     """
 
-    close: weakref.finalize
+    recipe: Any  # a Recipe
+    state_dim: int = 0
+    fresh: bool = False
+    render_mode: str | None = None
+    reports: bool = False  # whether info has a success key
+    number: float = 0.0  # of the latest reset
+    taken: list[int] = field(default_factory=list)  # actions since
+    seen: Floats = field(default_factory=lambda: np.empty(0))  # latest observation
+    succeeded: bool = field(default=False, metadata=DERIVED)  # by the latest info
+    env: Any = field(default=None, metadata=DERIVED)  # None if closed
 
-    def __init__(
-        self,
-        recipe: Recipe,
-        state_dim: int = 0,
-        fresh: bool = False,
-        render_mode: str | None = None,
-    ) -> None:
-        self.recipe, self.state_dim, self.fresh = recipe, state_dim, fresh
-        self.render_mode = render_mode
-        self.reports = False  # whether info has a success key
-        self._map = recipe.mapping()
-        self._open()
+    def open(self) -> None:
+        """Make a new environment; it is closed at the latest when the process exits."""
+        self.close()
+        self._map = self.recipe.mapping()
+        self.env = self._call("the constructor", self.recipe.make, self.render_mode)
+        self._finalizer = weakref.finalize(self, _close, self.env)
+        self.seen = np.empty(0)
+        self.space = self._call("observation_space", lambda: self.env.observation_space)
+        self.members = vectors(self.space)
+        self.actions = self._call("action_space", lambda: self.env.action_space)
 
-    def _open(self) -> None:
-        env = self._call("the constructor", self.recipe.make, self.render_mode)
-        self.env: gymnasium.Env = env
-        self.close = weakref.finalize(self, _close, env)
-        self._used = False
-        self.space = self._call("observation_space", lambda: env.observation_space)
-        self.actions = self._call("action_space", lambda: env.action_space)
-        self._first_action: Any = getattr(self.actions, "start", 0)
+    def close(self) -> None:
+        """Close the environment."""
+        if self.env is not None:
+            self._finalizer()
+            self.env = None
 
-    def reset(self, seed: int) -> Floats:
-        """The first observation (d,) of an episode."""
-        if self._used:
-            if not self.fresh:
-                with suppress(BrokenSimulator):
-                    return self._reset(seed)
-            self.close()  # it may allow no reset before the end of an episode
-            self._open()
-        return self._reset(seed)
+    def reset(self, number: float) -> Floats:
+        """The first observation (d,) of the episode that a number in [0, 1) seeds."""
+        self.number, self.taken, used = number, [], self.seen.size > 0
+        if used and self.env is not None and not self.fresh:
+            # It may allow no reset before the end of an episode.
+            with suppress(BrokenSimulator):
+                return self._reset()
+        if used or self.env is None:
+            self.open()
+        return self._reset()
 
-    def _reset(self, seed: int) -> Floats:
-        answer = self._call("reset", self.env.reset, seed=seed)
-        seen, info = self._values("reset", answer, 2, "an observation and a dict")
-        self._success("reset", info)
-        first = self._vector("reset", seen)
-        self._used = True
-        return first
+    def _reset(self) -> Floats:
+        answer = self._call("reset", self.env.reset, seed=int(self.number * _SEEDS))
+        seen, info = self._values("reset", answer, "an observation, a dict")
+        self.succeeded = self._success("reset", info)
+        self.seen = self._vector("reset", seen)
+        return self.seen
 
-    def step(self, action: int) -> _Outcome:
-        """The outcome of one step with an action counted from 0."""
-        answer = self._call("step", self.env.step, action + self._first_action)
-        names = "observation, reward, terminated, truncated and info"
-        seen, reward, ended, cut, info = self._values("step", answer, 5, names)
-        return (
-            self._vector("step", seen),
-            self._plain("reward", reward, float),
-            self._plain("terminated", ended, bool),
-            self._plain("truncated", cut, bool),
-            self._success("step", info),
-        )
+    def step(self, action: int) -> tuple[Floats, float, bool, bool]:
+        """Observation (d,), reward, terminated, truncated; actions count from 0."""
+        if self.env is None:
+            self._replay()
+        self.taken.append(action)
+        first = getattr(self.actions, "start", 0)
+        answer = self._call("step", self.env.step, first + action)
+        names = "observation, reward, terminated, truncated, info"
+        seen, reward, ended, cut, info = self._values("step", answer, names)
+        self.seen = self._vector("step", seen)
+        number = self._plain("reward", reward, float)
+        ended = self._plain("terminated", ended, bool)
+        cut = self._plain("truncated", cut, bool)
+        self.succeeded = self._success("step", info)
+        return self.seen, number, ended, cut
+
+    def _replay(self) -> None:
+        number, taken, seen = self.number, self.taken, self.seen
+        self.reset(number)
+        for action in taken:
+            self.step(action)
+        if not np.array_equal(self.seen, seen):
+            problem = f"gave another observation after {len(taken)} steps of a replay"
+            expected = "the same after the same reset(seed=…) and actions"
+            raise self.broken("step", problem, expected)
 
     def broken(self, method: str, problem: str, expected: str) -> BrokenSimulator:
         """The error that names the environment, method, problem and expected answer."""
@@ -111,267 +126,154 @@ class Simulator:
         except _PASSING:
             raise
         except BaseException as error:  # any foreign error, SystemExit too
-            expected = "no error; mend the environment"
-            if isinstance(error, ModuleNotFoundError) and error.name:
-                package = error.name.partition(".")[0]
-                expected = f"no error; pip install {package}, or mend the environment"
-            if method == "reset":
-                expected += " (reset(*, seed=None, options=None))"
-            raise self.broken(method, f"raised {described(error)}", expected) from error
+            problem = f"raised {described(error)}"
+            expected = "no error, and the methods of Gymnasium 0.26 and later"
+            raise self.broken(method, problem, expected) from error
 
-    def _values(self, method: str, answer: Any, count: int, names: str) -> Any:
-        if isinstance(answer, (tuple, list)) and len(answer) == count:
+    def _values(self, method: str, answer: Any, names: str) -> Any:
+        """The values of an answer, as many as `names` says."""
+        sequence, count = isinstance(answer, (tuple, list)), names.count(",") + 1
+        if sequence and len(answer) == count:
             return answer
-        expected = f"{count} values, {names}, as in Gymnasium 0.26 and later"
-        raise self.broken(method, f"gave {_shown(answer)}", expected)
+        found = f"{len(answer)} values" if sequence else _shown(answer)
+        expected = f"{count} values: {names}, as in Gymnasium 0.26 and later"
+        raise self.broken(method, f"gave {found}", expected)
 
     def _vector(self, method: str, seen: Any) -> Floats:
         """An observation as a new vector (d,) of finite numbers."""
-        space = self.space
+        space = self.members
         if self._map is not None:
             method, space = f"env.observation={self.recipe.observation}", None
             seen = self._call(method, self._map, seen)
-        vector = np.array(self._flat(method, space, seen), np.float64)
+        if space is None or isinstance(space, spaces.Box):
+            seen = array = self._call(method, np.asarray, seen)
+            fits = array.dtype.kind in "biuf"
+            fits &= space is None or array.size == math.prod(space.shape)
+        elif fits := self._call(method, space.contains, seen):
+            array = self._call(method, spaces.flatten, space, seen)
+        if not fits:
+            expected = f"real numbers, a member of {str(space)[:90]}"
+            raise self.broken(method, f"gave {_shown(seen)}", expected)
+        vector = np.array(array, np.float64).reshape(-1)
         d = self.state_dim = self.state_dim or len(vector)
         if len(vector) != max(d, 1):
             expected = f"{max(d, 1)} or, at the first reset, more"
             raise self.broken(method, f"gave {len(vector)} numbers", expected)
         if not np.abs(vector).max() <= LARGEST:
-            place = np.flatnonzero(~(np.abs(vector) <= LARGEST))[0]
-            problem = f"gave an observation with {vector[place]} as component {place}"
-            expected = f"finite numbers of at most {LARGEST:.3g} (float32); "
-            expected += "a wrapper in env.wrappers may rescale them"
-            raise self.broken(method, problem, expected)
+            worst = vector[np.argmin(np.abs(vector) <= LARGEST)]
+            expected = f"finite numbers of at most {LARGEST:.3g} (float32)"
+            raise self.broken(method, f"gave {worst} in an observation", expected)
         return vector
-
-    def _flat(self, method: str, space: spaces.Space | None, seen: Any) -> NDArray:
-        """A member of `space` (None: any numbers) as a vector, without a cast."""
-        parts = _parts(space)
-        if parts is not None:
-            sequence = isinstance(seen, (tuple, list))
-            keys = range(len(seen)) if sequence else seen
-            if (sequence or isinstance(seen, dict)) and set(keys) == parts.keys():
-                found = (
-                    self._flat(f"{method} [{key!r}]", part, seen[key])
-                    for key, part in parts.items()
-                )
-                return np.concatenate([np.empty(0), *found])
-        elif space is None or isinstance(space, spaces.Box):
-            array = self._call(method, np.asarray, seen)
-            fits = space is None or array.size == math.prod(space.shape)
-            if fits and array.dtype.kind in "biuf":
-                return array.reshape(-1)
-        elif self._call(method, space.contains, seen):
-            return self._call(method, spaces.flatten, space, seen)
-        expected = "real numbers" + (
-            f", a member of {shortened(space)}" if space else ""
-        )
-        raise self.broken(method, f"gave {_shown(seen)}", expected)
 
     def _plain(self, name: str, value: Any, kind: type[float]) -> Any:
         """One finite number (kind float) or one boolean, from an array or a scalar."""
         if type(value) is kind and math.isfinite(value):
             return value
         array = self._call(f"step's {name}", np.asarray, value)
-        allowed = _is_boolean(array) if kind is bool else _is_finite(array)
-        if array.size != 1 or not allowed:
+        number = (
+            array.item() if array.size == 1 and array.dtype.kind in "biuf" else None
+        )
+        if number is None or not math.isfinite(number) or kind(number) != number:
             expected = "True or False" if kind is bool else "one finite real number"
             raise self.broken("step", f"gave {name} {_shown(value)}", expected)
-        return kind(array.item())
+        return kind(number)
 
     def _success(self, method: str, info: Any) -> bool:
         """Whether info reports a success; a rate, a text or None reports nothing."""
         if not isinstance(info, dict):
-            raise self.broken(
-                method, f"gave info {_shown(info)}", "a dict as last value"
-            )
+            problem = f"gave info {_shown(info)}"
+            raise self.broken(method, problem, "a dict as last value")
         for key in _SUCCESS_KEYS:
-            if key in info:
-                value = self._call(f'{method}\'s info["{key}"]', np.asarray, info[key])
-                if _is_boolean(value):
-                    self.reports = True
-                    return bool(value.all())
+            value = self._call(f"{method}'s info of {key}", np.asarray, info.get(key))
+            if value.dtype.kind in "biuf" and np.isin(value, (0, 1)).all():
+                self.reports = True
+                return bool(value.all())
         return False
-
-
-def _empty() -> NDArray:
-    return np.empty(0)
 
 
 @storable
 @dataclass(eq=False)
-class SimulatedLanes:
-    """The `Lanes` of a simulated task, counted in C order: n of them.
+class SimulatedLanes(Lanes):
+    """The lanes of a simulated task, counted in C order."""
 
-    An episode follows from the number that reset its lane and the actions since. Only
-    these are stored: lanes from a checkpoint play them again, and a lane fails if that
-    leads elsewhere. A failed lane gives observations and rewards of 0.
-    """
-
-    env: Any  # a `Gymnasium`: recipe, state_dim, horizon, fresh
     shape: tuple[int, ...] = (0,)  # the lanes' axes
-    start: Floats = field(default_factory=_empty)  # (n,) in [0, 1)
-    taken: NDArray = field(default_factory=_empty)  # (n, horizon) actions, int16
-    length: NDArray = field(default_factory=_empty)  # (n,) number of these actions
-    seen: Floats = field(default_factory=_empty)  # (n, d) latest observations
-    failures: dict[int, str] = field(default_factory=dict)
-    running: list[Simulator | None] = field(default_factory=list, metadata=DERIVED)
-    reported: list[bool] = field(default_factory=list, metadata=DERIVED)
+    simulators: list[Simulator] = field(default_factory=list)
 
     def begin(self, start: Floats) -> Floats:
         """First observations (..., d) after resets by numbers (..., 1) in [0, 1)."""
         self.close()
-        self.shape, n = start.shape[:-1], start[..., 0].size
-        self.start, self.failures = np.zeros(n), {}
-        self.length = np.zeros(n, np.intp)
-        self.taken = np.zeros((n, self.env.horizon), np.int16)
-        self.seen = np.zeros((n, self.env.state_dim))
-        self._open()
-        state = self.seen.reshape(*self.shape, self.env.state_dim)
+        self.shape, self.failures = start.shape[:-1], {}
+        self.simulators = [self.env.simulator() for _ in range(start[..., 0].size)]
+        state = np.zeros((*self.shape, self.env.state_dim))
         return self.restart(np.ones(self.shape, bool), start, state)
 
     def step(
-        self,
-        state: Floats | None,
-        action: NDArray,
-        noise: Floats | None,
-        lanes: Any = ...,
+        self, state: Any, action: NDArray, noise: Any, lanes: Any = ...
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Observations, rewards, terminated and truncated of the chosen lanes."""
-        self._resume()
-        chosen, acts = self._chosen(lanes), action.reshape(-1)
-        self.taken[chosen, self.length[chosen]] = acts
-        self.length[chosen] += 1
-        n = len(chosen)
-        after, reward = np.zeros((n, self.env.state_dim)), np.zeros(n)
-        ended, cut = np.zeros(n, bool), np.ones(n, bool)
-        for i, (lane, act) in enumerate(zip(chosen, acts.tolist(), strict=True)):
-            if (found := self._answer(lane, "step", act)) is not None:
-                after[i], reward[i], ended[i], cut[i], self.reported[lane] = found
-        self.seen[chosen] = after
-        shape = action.shape
-        after = after.reshape(*shape, self.env.state_dim)
-        return after, reward.reshape(shape), ended.reshape(shape), cut.reshape(shape)
+        otherwise = np.zeros(self.env.state_dim), 0.0, False, True
+        pairs = zip(self._chosen(lanes), action.reshape(-1).tolist(), strict=True)
+        found = [self._answer(lane, "step", each, otherwise) for lane, each in pairs]
+        after, *others = map(np.array, zip(*found, strict=True))
+        reward, ended, cut = (each.reshape(action.shape) for each in others)
+        return after.reshape(*action.shape, -1), reward, ended, cut
 
     def restart(self, over: Bools, start: Floats, state: Floats) -> Floats:
         """All observations; lanes that are over are reset."""
-        self._resume()
-        chosen, state = self._chosen(over), state.copy()
-        self.start[chosen], self.length[chosen] = start[over][:, 0], 0
-        for lane in chosen:
-            first = self._reset(lane)
-            self.seen[lane] = 0.0 if first is None else first
-        state[over] = self.seen[chosen]
+        state, zeros = state.copy(), np.zeros(self.env.state_dim)
+        for place, lane in zip(np.argwhere(over), self._chosen(over), strict=True):
+            number = float(start[tuple(place)][0])
+            state[tuple(place)] = self._answer(lane, "reset", number, zeros)
         return state
 
     def close(self) -> None:
         """Close every simulator."""
-        for simulator in filter(None, self.running):
+        for simulator in self.simulators:
             simulator.close()
-        self.running = []
 
     @property
     def succeeded(self) -> Bools:
         """Whether the latest info of each lane reported success, (...)."""
-        return np.array(self.reported, bool).reshape(self.shape)
+        return np.array([s.succeeded for s in self.simulators]).reshape(self.shape)
 
     def _chosen(self, lanes: Any) -> list[int]:
         """The numbers of lanes that index the lanes' axes."""
-        numbers = np.arange(len(self.length)).reshape(self.shape)
+        numbers = np.arange(len(self.simulators)).reshape(self.shape)
         return numbers[lanes].reshape(-1).tolist()
 
-    def _open(self) -> None:
-        n, env = len(self.length), self.env
-        self.running, self.reported = [None] * n, [False] * n
-        for lane in set(range(n)) - self.failures.keys():
+    def _answer(self, lane: int, method: str, argument: float, otherwise: Any) -> Any:
+        """The answer of a lane's simulator; `otherwise` from the time it has failed."""
+        if lane not in self.failures:
             try:
-                self.running[lane] = Simulator(env.recipe, env.state_dim, env.fresh)
+                return getattr(self.simulators[lane], method)(argument)
             except BrokenSimulator as error:
                 self.failures[lane] = str(error)
-
-    def _answer(self, lane: int, method: str, argument: int) -> Any:
-        """The answer of a lane's simulator; None from the time it has failed."""
-        simulator = self.running[lane]
-        if simulator is None:
-            return None
-        try:
-            return getattr(simulator, method)(argument)
-        except BrokenSimulator as error:
-            self._fail(lane, simulator, error)
-            return None
-
-    def _fail(self, lane: int, simulator: Simulator, error: BrokenSimulator) -> None:
-        self.failures[lane], self.running[lane] = str(error), None
-        simulator.close()
-
-    def _reset(self, lane: int) -> Floats | None:
-        return self._answer(lane, "reset", reset_seed(self.start[lane]))
-
-    def _resume(self) -> None:
-        """Open lanes from a checkpoint and play their episodes again."""
-        if self.running or not len(self.length):
-            return
-        self._open()
-        for lane, length in enumerate(self.length.tolist()):
-            now: Any = self._reset(lane)
-            for action in self.taken[lane, :length].tolist():
-                found = self._answer(lane, "step", action)
-                now = None if found is None else found[0]
-            simulator = self.running[lane]
-            if simulator and not (now == self.seen[lane]).all():
-                problem = f"gave another observation after {length} steps of a replay"
-                expected = "the same after the same reset(seed=…) and actions"
-                error = simulator.broken("step", problem, expected)
-                self._fail(lane, simulator, error)
+                self.simulators[lane].close()
+        return otherwise
 
 
-def reset_seed(number: float) -> int:
-    """The seed of a reset for a number in [0, 1)."""
-    return int(number * _SEEDS)
+def vectors(space: Any) -> spaces.Space | None:
+    """A space whose members become vectors of one length, its Boxes without bounds.
 
-
-def is_plain(space: spaces.Space) -> bool:
-    """Whether the members of a space can be flattened to a vector of fixed length."""
-    parts = _parts(space)
-    if parts is None:
-        return isinstance(space, _PLAIN)
-    return all(map(is_plain, parts.values()))
-
-
-def shortened(value: Any) -> str:
-    """The first 70 characters of a value in a message."""
-    try:
-        text = " ".join(repr(value).split())
-    except Exception:  # of foreign code
-        text = f"a {type(value).__name__}"
-    return text if len(text) <= 70 else f"{text[:69]}…"
+    So no cast hides what float32 does not resolve. None for other spaces.
+    """
+    if isinstance(space, spaces.Box):
+        return spaces.Box(-np.inf, np.inf, space.shape, np.float64)
+    if isinstance(space, spaces.Dict):
+        named: Any = [(key, vectors(part)) for key, part in space.items()]
+        return None if any(part is None for _, part in named) else spaces.Dict(named)
+    if isinstance(space, spaces.Tuple):
+        parts: Any = list(map(vectors, space))
+        return None if None in parts else spaces.Tuple(parts)
+    return space if isinstance(space, _VECTORS) else None
 
 
 def _shown(value: Any) -> str:
-    """A wrong value in a message, with its type."""
-    if isinstance(value, (tuple, list)):
-        return f"{len(value)} values: {shortened(value)}"
+    """A wrong value in a message, on one short line, with its type."""
     if isinstance(value, np.ndarray) and value.ndim:
         return f"an array of shape {value.shape} and type {value.dtype}"
-    return f"{shortened(value)} of type {type(value).__name__}"
-
-
-def _parts(space: spaces.Space | None) -> dict[Any, spaces.Space] | None:
-    """The spaces inside a Dict or Tuple by key or place; None for other spaces."""
-    if isinstance(space, spaces.Dict):
-        return space.spaces
-    if isinstance(space, spaces.Tuple):
-        return dict(enumerate(space.spaces))
-    return None
-
-
-def _is_finite(array: NDArray) -> bool:
-    return array.dtype.kind in "biuf" and bool(np.isfinite(array).all())
-
-
-def _is_boolean(array: NDArray) -> bool:
-    """Whether all entries are booleans, or the numbers 0 and 1."""
-    return array.dtype.kind in "biuf" and bool(((array == 0) | (array == 1)).all())
+    text = " ".join(reprlib.repr(value).split())
+    return f"{text} of type {type(value).__name__}"
 
 
 def _close(env: gymnasium.Env) -> None:

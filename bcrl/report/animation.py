@@ -8,9 +8,8 @@ import numpy as np
 from PIL import Image
 
 from bcrl.common.files import write_atomically
-from bcrl.envs import is_simulated
+from bcrl.envs import is_simulated, tasks_of
 from bcrl.envs.rendering import draw, frames_per_second
-from bcrl.envs.tasks import tasks_of
 from bcrl.errors import BcrlError, did_you_mean
 from bcrl.report.variants import Runs, Variant
 

@@ -1,21 +1,15 @@
 """The car on the hill against physics computed in other ways."""
 
-from __future__ import annotations
-
-import math
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import odeint
 
-from bcrl.envs.car_on_hill import ENV, CarOnHill
-from bcrl.errors import ConfigError
+from bcrl.envs.car_on_hill import CarOnHill
 
-MASSES = (0.8, 1.0, 1.2)
+masses = pytest.mark.parametrize("mass", (0.8, 1.0, 1.2))
 
 
-def motion(y: NDArray[np.float64], _: float, force: float, mass: float) -> list[float]:
+def motion(y, _, force, mass):
     """The equations of motion, as the paper writes them."""
     p, v = y
     slope = 2 * p + 1 if p < 0 else (1 + 5 * p * p) ** -1.5
@@ -24,7 +18,7 @@ def motion(y: NDArray[np.float64], _: float, force: float, mass: float) -> list[
     return [v, push / (mass * (1 + slope * slope))]
 
 
-def scattered(n: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def scattered(n, seed):
     """Thirds of n states anywhere, crossing p = 0 and grazing it; and actions."""
     rng = np.random.default_rng(seed)
     state = rng.uniform((-1, -3), (1, 3), (n, 2))
@@ -35,19 +29,17 @@ def scattered(n: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.int64]
     return state, rng.integers(0, 2, n)
 
 
-def energy(
-    state: NDArray[np.float64], pull: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def energy(state, pull):
     """Conserved energy per mass: kinetic, gravity, and the held force's potential."""
-    p, v = state[..., 0], state[..., 1]
+    p, v = state.T
     height = np.where(p < 0, p * p + p, p / np.sqrt(1 + 5 * p * p))
     slope = np.where(p < 0, 2 * p + 1, (1 + 5 * p * p) ** -1.5)
     return 0.5 * (1 + slope**2) * v**2 + 9.81 * height - pull * p
 
 
-@pytest.mark.parametrize("mass", MASSES)
-def test_step_agrees_with_odeint(mass: float) -> None:
-    state, action = scattered(1500, seed=1)
+@masses
+def test_step_agrees_with_odeint(mass):
+    state, action = scattered(600, seed=1)
     after, _, _ = CarOnHill(mass=mass).step(state, action)
     forces = np.where(action == 1, 4.0, -4.0)
     tight = {"rtol": 1e-11, "atol": 1e-11}
@@ -55,89 +47,53 @@ def test_step_agrees_with_odeint(mass: float) -> None:
         odeint(motion, s, [0, 0.1], args=(u, mass), **tight)[1]
         for s, u in zip(state, forces, strict=True)
     ]
-    assert (np.sign(state[:, 0]) != np.sign(after[:, 0])).sum() > 300  # many crossings
+    assert (np.sign(state[:, 0]) != np.sign(after[:, 0])).sum() > 120  # many crossings
     assert abs(after - expected).max() < 2e-7
 
 
-@pytest.mark.parametrize("mass", MASSES)
-def test_energy_is_conserved_while_a_force_is_held(mass: float) -> None:
+@masses
+def test_energy_is_conserved_while_a_force_is_held(mass):
     state, action = scattered(30_000, seed=2)
     after, _, _ = CarOnHill(mass=mass).step(state, action)
     pull = np.where(action == 1, 4.0, -4.0) / mass
     assert abs(energy(after, pull) - energy(state, pull)).max() < 1e-6
 
 
-def test_equilibrium_on_the_slope_stays() -> None:
-    # held force u balances gravity where h' = u / (m g) = 0.4 / 9.81
-    p = (4.0 / (9.81 * 1.0) - 1.0) / 2.0
-    after, reward, absorbing = CarOnHill().step(np.array([p, 0.0]), np.array(1))
-    np.testing.assert_allclose(after, [p, 0.0], atol=1e-14)
-    assert reward == 0.0
-    assert not absorbing
-
-
-def test_reward_and_absorption_follow_the_bounds() -> None:
+def test_reward_and_absorption_follow_the_bounds():
     state = np.array([[0.95, 1.0], [0.95, 2.99], [-0.95, -1.0], [-0.5, 0.0]])
     after, reward, absorbing = CarOnHill().step(state, np.array([1, 1, 0, 0]))
     p, v = after.T
     lost = (p < -1) | (abs(v) > 3)
     np.testing.assert_array_equal(reward, np.where(lost, -1, np.where(p > 1, 1, 0)))
     np.testing.assert_array_equal(absorbing, reward != 0)
-    assert set(reward[:1]) == {1.0}
-    assert set(reward[2:]) == {-1.0, 0.0}
+    assert reward[0] == 1.0 and set(reward[2:]) == {-1.0, 0.0}
 
 
-def test_states_once_left_stay_without_warnings() -> None:
+def test_states_once_left_stay_without_warnings():
     outside = np.array([[1.1, 0.0], [-1.5, 0.0], [0.0, 3.1], [np.nan, 0.0], [1e300, 9]])
     after, reward, absorbing = CarOnHill().step(outside, np.ones(5, dtype=int))
     np.testing.assert_array_equal(after, outside)
-    assert absorbing.all()
-    assert not reward.any()
+    assert absorbing.all() and not reward.any()
 
 
-def test_a_lane_does_not_depend_on_its_batch() -> None:
-    env = CarOnHill(mass=1.2)
-    state, action = scattered(999, seed=3)
-    together = env.step(state.reshape(9, 111, 2), action.reshape(9, 111))
-    strided = env.step(np.asfortranarray(state), action.astype(np.int8))
-    for i in (0, 400, 998):
-        alone = env.step(state[i], action[i])
-        for one, many, again in zip(alone, together, strided, strict=True):
-            same = many.reshape(999, -1)[i].tobytes()
-            assert same == one.tobytes() == again[i].tobytes()
-            assert one.shape == many.shape[2:]
-
-
-def test_shapes_broadcast_and_inputs_are_left_alone() -> None:
+def test_shapes_broadcast_and_inputs_are_left_alone():
     env = CarOnHill()
     state = env.evaluation_states()
     kept = state.copy()
     after, reward, absorbing = env.step(state[:, None], np.arange(2))
-    assert after.shape == (100, 2, 2)
-    assert reward.shape == absorbing.shape == (100, 2)
+    assert after.shape == (100, 2, 2) and reward.shape == absorbing.shape == (100, 2)
     np.testing.assert_array_equal(after[:, 1], env.step(state, np.ones(100, int))[0])
+    strided = env.step(np.asfortranarray(state), np.ones(100, np.int8))
+    np.testing.assert_array_equal(after[:, 1], strided[0])
     np.testing.assert_array_equal(state, kept)
-    assert [part.size for part in env.step(state[:0], np.zeros(0, int))] == [0, 0, 0]
     with pytest.raises(IndexError):
         env.step(state[0], np.array(2))
 
 
-def test_start_and_grid() -> None:
-    env = ENV()
-    np.testing.assert_array_equal(env.initial(np.zeros((3, 4, 0)))[2, 3], [-0.5, 0.0])
-    assert env.initial(np.zeros((3, 4, 0))).shape == (3, 4, 2)
+def test_start_and_grid():
+    env = CarOnHill()
+    starts = env.initial(np.zeros((3, 4, 0)))
+    assert starts.shape == (3, 4, 2) and starts[2, 3].tolist() == [-0.5, 0.0]
     grid = env.evaluation_states()
-    assert grid.shape == (100, 2)
-    np.testing.assert_array_equal(grid[0], [-1, -3])
-    np.testing.assert_array_equal(grid[-1], [1, 3])
+    assert grid.shape == (100, 2) and grid[[0, -1]].tolist() == [[-1, -3], [1, 3]]
     assert grid[1, 0] == -1.0  # position-major
-
-
-BAD = [("mass", 0.0), ("mass", math.nan), ("mass", math.inf)]
-BAD += [("gamma", 1.0), ("horizon", 0)]
-
-
-@pytest.mark.parametrize(("key", "bad"), BAD)
-def test_impossible_constants_are_rejected_by_name(key: str, bad: float) -> None:
-    with pytest.raises(ConfigError, match=rf"env\.{key}={bad}"):
-        CarOnHill(**{key: bad})

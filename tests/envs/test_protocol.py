@@ -1,12 +1,16 @@
-"""Errors in a user's environment or script are named before any work."""
+"""What holds for all our environments; a user's errors are named before any work."""
 
 import sys
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from sklearn.neighbors import KNeighborsRegressor
 
 from bcrl.api import FQI, Boost, Forest, ResidualPolicy, Tabular, run, stages
+from bcrl.envs.car_on_hill import CarOnHill
+from bcrl.envs.linear_system import LinearSystem
+from bcrl.envs.maze import Maze
 from bcrl.errors import ConfigError
 from tests.toys import OpenCorridor
 
@@ -18,62 +22,72 @@ def variant(**changes) -> OpenCorridor:
     return dataclass(frozen=True)(type("Mine", (OpenCorridor,), changes))()
 
 
-def step(self, state, action, noise=None, change=lambda *x: x):
-    return change(*OpenCorridor.step(self, state, action))
-
-
 def changed(change):
-    return {"step": lambda *a: step(*a, change=change)}
+    """Another answer of `step`."""
+    return {"step": lambda self, s, a, _: change(*OpenCorridor.step(self, s, a))}
 
 
 DICE, BUFFER = iter(range(1000)), {}
-#: The change, and words of the message.
+#: Words of the message, and the change.
 WRONG = {
-    "other states": ({"state_dim": 2}, r"initial: states have shape \(16, 4, 1\)"),
-    "no number": ({"initial_noise": None}, "initial_noise is None"),
-    "rewards with an axis": (
-        changed(lambda s, r, a: (s, r[..., None], a)),
-        r"rewards have shape \(16, 4, 1\), expected \(16, 4\)",
-    ),
-    "no booleans": (changed(lambda s, r, a: (s, r, {})), "absorbing have shape None"),
-    "floats as ends": (changed(lambda s, r, a: (s, r, 1.0 * a)), "must be booleans"),
-    "two values": (changed(lambda s, r, a: (s, r)), "2 values"),
-    "no reward": (changed(lambda s, r, a: (s, r * np.nan, a)), "finite"),
-    "dice": (changed(lambda s, r, a: (s, r + next(DICE), a)), "comes in as noise"),
-    "late dice": (
-        changed(lambda s, r, a: (s, r + (s[..., 0] == 4) * next(DICE), a)),
-        "comes in as noise",
-    ),
-    "an exception": ({"step": lambda *_: 1 / 0}, "step failed: ZeroDivisionError"),
-    "an exit": ({"step": lambda *_: sys.exit(3)}, "SystemExit: 3"),
-    "noise changed in place": (
-        {"initial": lambda self, noise: np.add(noise, 1, out=noise)},
-        "changes its arguments",
-    ),
-    "states that grow without bound": (
-        changed(lambda s, r, a: (np.where(s == 4, 1e39, s), r, a)),
-        "step: states .*float32",
-    ),
-    "one buffer": (
-        changed(lambda s, r, a: (BUFFER.setdefault(s.shape, s), r, a)),
-        "one array again and again",
-    ),
-    "no threshold": ({"success": "threshold"}, "success_threshold is None"),
-    "an unknown rule": ({"success": "info"}, "success=info"),
-    "no hash": ({"__hash__": lambda self: hash([])}, "tuple.*list"),
-    "no start": (
-        {"evaluation_states": lambda self: np.zeros((0, 1))},
-        "evaluation_states: states have shape",
-    ),
-    "nothing for a start": ({"evaluation_states": lambda self: None}, "shape None"),
+    r"initial: states .* \(16, 4, 1\)": {"state_dim": 2},
+    "initial_noise is None": {"initial_noise": None},
+    r"\(16, 4, 1\) .* \(16, 4\)": changed(lambda s, r, a: (s, r[..., None], a)),
+    "absorbing have shape None": changed(lambda s, r, a: (s, r, {})),
+    "float64, expected booleans": changed(lambda s, r, a: (s, r, 1.0 * a)),
+    "env.name=corridor: step gives 2 values": changed(lambda s, r, a: (s, r)),
+    "rewards must be finite": changed(lambda s, r, a: (s, r * np.nan, a)),
+    "other rewards": changed(lambda s, r, a: (s, r + next(DICE), a)),
+    "noise": changed(lambda s, r, a: (s, r + (s[..., 0] == 4) * next(DICE), a)),
+    "ZeroDivisionError": {"step": lambda *_: 1 / 0},
+    "SystemExit: 3": {"step": lambda *_: sys.exit(3)},
+    "its arguments": {"initial": lambda self, noise: np.add(noise, 1, out=noise)},
+    "step: .*float32": changed(lambda s, r, a: (np.where(s == 4, 1e39, s), r, a)),
+    "one array": changed(lambda s, r, a: (BUFFER.setdefault(s.shape, s), r, a)),
+    "success_threshold is None": {"success": "threshold"},
+    "success=info": {"success": "info"},
+    "tuple.*list": {"__hash__": lambda self: hash([])},
+    "there are no states": {"evaluation_states": lambda self: np.zeros((0, 1))},
+    "shape None": {"evaluation_states": lambda self: None},
 }
 
 
-@pytest.mark.parametrize("name", WRONG)
-def test_a_broken_contract_is_named(name):
-    changes, words = WRONG[name]
+@pytest.mark.parametrize("words", WRONG)
+def test_a_broken_contract_is_named(words):
     with pytest.raises(ConfigError, match=words):
-        stages([variant(**changes)], LEARNER)
+        stages([variant(**WRONG[words])], LEARNER)
+
+
+@pytest.mark.parametrize(
+    "env", [CarOnHill(1.2), Maze(0.55), LinearSystem(), LinearSystem("lq")], ids=repr
+)
+def test_a_batch_steps_as_its_lanes_do(env):
+    rng = np.random.default_rng(0)
+    state = env.initial(rng.random((6, 7, env.initial_noise)))
+    for _ in range(20):
+        action = rng.integers(env.n_actions, size=(6, 7))
+        given = state, action, rng.random((6, 7, env.step_noise))
+        together = env.step(*given)
+        for lane in np.ndindex(6, 7):
+            alone = env.step(*(x[lane] for x in given))
+            for many, one in zip(together, alone, strict=True):
+                assert many[lane].tobytes() == one.tobytes()
+        state = together[0]
+
+
+IMPOSSIBLE = {
+    CarOnHill: {"mass": (0.0, np.nan, np.inf), "gamma": (1.0,), "horizon": (0,)},
+    Maze: {"height": (1.0,), "preset": ("relesed",)},
+    LinearSystem: {"task": ("lqr",), "preset": ("relesed",), "gamma": (-0.1, np.nan)},
+}
+
+
+@pytest.mark.parametrize("cls", IMPOSSIBLE)
+def test_impossible_constants_are_rejected_by_name(cls):
+    for key, values in IMPOSSIBLE[cls].items():
+        for bad in values:
+            with pytest.raises(ConfigError, match=rf"env\.{key}={bad}"):
+                cls(**{key: bad})
 
 
 def test_an_environment_that_is_right_passes():
@@ -90,40 +104,35 @@ def test_a_parameter_has_to_have_an_effect():
     assert len(stages([ignored(prize=1.0), ignored(prize=2.0)], LEARNER)) == 2
 
 
-@pytest.mark.parametrize(
-    ("tasks", "learner", "transfers", "words"),
-    [
-        ([], LEARNER, (), "0 tasks"),
-        ([OpenCorridor()], [LEARNER] * 2, (), "there are 2 learners"),
-        ([OpenCorridor()], LEARNER, (Boost,), r"write Boost\(\)"),
-        ([OpenCorridor()], LEARNER, (ResidualPolicy(),), "FQI learns from whole"),
-        ([OpenCorridor()], FQI(1, 1, Tabular), (), "is no regressor"),
-        ([OpenCorridor()], "FQI", (), "learners"),
-    ],
-)
-def test_stages_refuses_what_makes_no_sense(tasks, learner, transfers, words):
+HERE = [OpenCorridor()]
+SENSELESS = {
+    "0 tasks": ([], LEARNER),
+    "there are 2 learners": (HERE, [LEARNER] * 2),
+    r"write Boost\(\)": (HERE, LEARNER, Boost),
+    "FQI learns from whole": (HERE, LEARNER, ResidualPolicy()),
+    "is no regressor": (HERE, FQI(1, 1, Tabular)),
+    r"Sklearn\(estimator\)": (HERE, FQI(1, 1, KNeighborsRegressor())),
+    "learners": (HERE, "FQI"),
+    "None: is no learner": (HERE, None),
+    "tasks=m: ": ("maze", LEARNER),
+    "tasks=<class": ([OpenCorridor], LEARNER),
+    "tasks=None": ([None], LEARNER),
+    "env.horizon=0": ([OpenCorridor(horizon=0)], LEARNER),
+    "env.horizon=3.0": ([OpenCorridor(horizon=3.0)], LEARNER),
+    "env.gamma=1.0": ([OpenCorridor(gamma=1.0)], LEARNER),
+}
+
+
+@pytest.mark.parametrize("words", SENSELESS)
+def test_stages_refuses_what_makes_no_sense(words):
     with pytest.raises(ConfigError, match=words):
-        stages(tasks, learner, *transfers)
+        stages(*SENSELESS[words])
 
 
 @pytest.mark.parametrize("seeds", [3, [], [0, 0], [-1], np.int64(3), [0.5]])
 def test_seeds_are_different_numbers(seeds):
     with pytest.raises(ConfigError, match="seeds"):
-        run(stages([OpenCorridor()], LEARNER), seeds, progress=False)
-
-
-def test_an_estimator_of_scikit_learn_is_to_be_wrapped():
-    from sklearn.neighbors import KNeighborsRegressor
-
-    bare = FQI(iterations=1, episodes=1, regressor=KNeighborsRegressor())
-    with pytest.raises(ConfigError, match=r"Sklearn\(estimator\)"):
-        stages([OpenCorridor()], bare)
-
-
-@pytest.mark.parametrize("values", [{"horizon": 0}, {"horizon": 3.0}, {"gamma": 1.0}])
-def test_horizon_and_discount_are_checked(values):
-    with pytest.raises(ConfigError, match=next(iter(values))):
-        stages([OpenCorridor(**values)], LEARNER)
+        run(stages(HERE, LEARNER), seeds, progress=False)
 
 
 def test_scripts_may_count_in_numpys_integers_and_in_generators():
@@ -133,11 +142,3 @@ def test_scripts_may_count_in_numpys_integers_and_in_generators():
     made = stages((env for env in [OpenCorridor()]), (x for x in [learner]))
     found = run(made, np.arange(1), asked, progress=False)
     assert found.equals(plain)
-
-
-@pytest.mark.parametrize("tasks", ["maze", [OpenCorridor], [None]])
-def test_what_is_no_environment_is_named(tasks):
-    with pytest.raises(ConfigError, match="tasks="):
-        stages(tasks, LEARNER)
-    with pytest.raises(ConfigError, match="None: is no learner"):
-        stages([OpenCorridor()], None)

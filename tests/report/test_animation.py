@@ -155,7 +155,7 @@ def test_a_simulators_episode_is_played_once_more(tmp_path):
     shown, _ = frames(variant, 0)
     (actions,) = variant.arrays(0, "trajectory_actions")
     assert len(shown) == len(actions) + 1
-    env = made.target.recipe.make("rgb_array")
+    env = made.target.make("rgb_array")
     (start,) = variant.arrays(0, "trajectory_start")
     env.reset(seed=int(start[0] * 2**31))
     for action, picture in zip(actions, shown[1:], strict=True):
