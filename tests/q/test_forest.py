@@ -18,7 +18,7 @@ from bcrl.q.forest.forest import (
     join,
     predict_forests,
 )
-from bcrl.q.forest.predict import TOGETHER
+from bcrl.q.forest.trees import TOGETHER
 
 PAPER = TreeSettings(min_samples_split=5, min_samples_leaf=2)
 SEEDS = 200  # forests per side of a comparison
@@ -293,9 +293,9 @@ def test_bad_input_is_rejected():
     ):
         with pytest.raises(BcrlError, match=message):
             fit_forests([Regression(**(good | bad))], PAPER)
-    for settings in (TreeSettings(1), TreeSettings(2, 0), TreeSettings(2, 1, 0)):
+    for settings in ((1,), (2, 0), (2, 1, 0), (2, 1, None, 0)):
         with pytest.raises(ConfigError, match="at least"):
-            fit_forests([Regression(**good)], settings)
+            TreeSettings(*settings)
     with pytest.raises(ConfigError, match="threads"):
         fit_forests([Regression(**good)], PAPER, threads=0)
 
@@ -394,7 +394,7 @@ def test_other_weights_than_whole_numbers_are_rejected(name, value):
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        *(("max_features", x) for x in (0, -1, 0.0, 1.5, "auto", True, [1])),
+        *(("max_features", x) for x in (0, -1, 0.0, 1.5, "auto", [1])),
         *(("max_depth", x) for x in (0, -3, 2.5, "deep")),
         *(("n_jobs", x) for x in (0, 1.5, "all")),
         *(("n_estimators", x) for x in (0, 2.5, None)),
@@ -404,7 +404,7 @@ def test_other_weights_than_whole_numbers_are_rejected(name, value):
 )
 def test_a_bad_parameter_is_rejected_by_name_and_value(key, value):
     x, y = three_features(10)
-    with pytest.raises(ValueError, match=f"{key}=") as raised:
+    with pytest.raises(ValueError, match=key) as raised:
         ExtraTrees().set_params(**{key: value}).fit(x, y)
     assert str(value) in str(raised.value)
 

@@ -7,14 +7,13 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch
-from numba import njit
 from threadpoolctl import threadpool_limits
 from torch.nn import functional
 
 from bcrl.common.seeding import stream
 from bcrl.learning.dqn_update import batched, one_by_one
 from bcrl.learning.replay import Replay
-from bcrl.q.networks import cpu, tiles
+from bcrl.q.networks import cpu
 from bcrl.q.networks.mlp import Adam, DeepQ, Networks, xavier
 
 D, A, BATCH = 4, 8, 32
@@ -241,38 +240,24 @@ def test_a_gradient_that_is_no_number_is_seen_in_the_weights(way):
     assert deep.online.flat[1].isnan().any()
 
 
-@njit
-def adam(to, gradient):
-    """A step of Adam on arrays (1, n): the gradient is a product of one term."""
-    one, only = np.ones(1, np.float32), np.zeros(1, np.int64)
-    n = to[0].shape[1]
-    tiles.product_adam(to, n, only, 1, only, 1, one, 0, 0, gradient)
-
-
-def test_faded_moments_become_zero_and_not_denormal():
-    smallest, n = np.finfo(np.float32).tiny, 50
-    rng = np.random.default_rng(0)
-    parameters = rng.standard_normal((1, n)).astype(np.float32)
-    first, second = np.zeros((2, 1, n), np.float32)
+@pytest.mark.parametrize("n", [50, 64, 150])
+def test_adam_is_the_papers_and_faded_moments_become_zero(n):
+    smallest, rng = np.finfo(np.float32).tiny, np.random.default_rng(0)
+    parameters = rng.standard_normal(n).astype(np.float32)
+    first, second = np.zeros((2, n), np.float32)
     optimiser = Adam.of(torch.zeros(1, n), 1e-4)
-    exact = [parameters.astype(float), np.zeros((1, n)), np.zeros((1, n))]
-    gradient = np.zeros((1, 64), np.float32)  # tiles read beyond n
-    gradient[:, :n] = 10.0 ** rng.uniform(-14, 0, n)
-    nothing = np.zeros_like(gradient)
+    x, m, v = parameters.astype(float), np.zeros(n), np.zeros(n)
+    gradient = (10.0 ** rng.uniform(-14, 0, n)).astype(np.float32)
     for step in range(1, 3001):
-        now = gradient if step <= 3 else nothing
-        beta1, beta2, *others = optimiser.next_step()
-        constants = (beta1, 1 - beta1, beta2, 1 - beta2, *others)
-        adam((parameters, first, second, *constants), now)
+        now = gradient if step <= 3 else np.zeros_like(gradient)
+        cpu.step_of_adam(parameters, first, second, now, optimiser.next_step())
         for moment in (first, second):
             assert not ((moment != 0) & (np.abs(moment) < smallest)).any()
-        exact[1] = 0.9 * exact[1] + 0.1 * now[:, :n]
-        exact[2] = 0.999 * exact[2] + 0.001 * now[:, :n].astype(float) ** 2
-        scaled = exact[1] / (1.0 - 0.9**step)
-        spread = np.sqrt(exact[2] / (1.0 - 0.999**step))
-        exact[0] = exact[0] - 1e-4 * scaled / (spread + 1e-8)
+        m, v = 0.9 * m + 0.1 * now, 0.999 * v + 0.001 * now.astype(float) ** 2
+        spread = np.sqrt(v / (1.0 - 0.999**step)) + 1e-8
+        x -= 1e-4 * m / (1.0 - 0.9**step) / spread
     assert not first.any()
-    assert np.abs(parameters - exact[0]).max() < 1e-6
+    assert np.abs(parameters - x).max() < 1e-6
 
 
 def test_a_deep_q_answers_stacked_and_listed_states_alike():

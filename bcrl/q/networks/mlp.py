@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bcrl.common.serialization import DERIVED, storable
 from bcrl.q.functions import Values, check_width, each
-from bcrl.q.networks import cpu, tiles
+from bcrl.q.networks import cpu
 
 Tensor = torch.Tensor
 
@@ -145,8 +145,8 @@ class Adam:
         first, second = self.moments
         first.lerp_(gradient, 1.0 - b1)
         second.mul_(b2).addcmul_(gradient, gradient, value=1.0 - b2)
-        first.masked_fill_(first.abs() < tiles.FADED, 0.0)
-        second.masked_fill_(second < tiles.FADED, 0.0)
+        first.masked_fill_(first.abs() < cpu.FADED, 0.0)
+        second.masked_fill_(second < cpu.FADED, 0.0)
         parameters.addcdiv_(first, second.sqrt().mul_(scale).add_(eps), value=-rate)
 
 
