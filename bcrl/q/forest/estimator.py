@@ -9,12 +9,7 @@ from joblib import effective_n_jobs
 from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.ensemble import ExtraTreesRegressor
-from sklearn.utils import check_random_state
-from sklearn.utils.validation import (
-    _check_sample_weight,
-    check_is_fitted,
-    validate_data,
-)
+from sklearn.utils import check_random_state, validation
 
 from bcrl.q.forest import forest
 
@@ -35,29 +30,21 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
 
     Parameters
     ----------
-    n_estimators : int, default 100
-        Number of trees.
-    max_depth : int or None, default None
-        Levels of splits that a tree may have; None is no limit.
-    min_samples_split : int, default 2
-        Fewest rows, weights counted, that a node must have to be split.
-    min_samples_leaf : int, default 1
-        Fewest rows, weights counted, on either side of a split.
-    max_features : int, float, "sqrt", "log2" or None, default None
-        Features tried per split: so many, such a share of them in (0, 1], or all.
-    random_state : int, RandomState or None, default None
-        Where the trees' seeds come from. An integer gives the same trees at every fit.
-    n_jobs : int or None, default None
-        Threads; None is 1, −1 is one per core. Never changes a result.
+    n_estimators : number of trees.
+    max_depth : levels of splits that a tree may have; None is no limit.
+    min_samples_split : fewest rows, weights counted, of a node that is split.
+    min_samples_leaf : fewest rows, weights counted, on either side of a split.
+    max_features : features tried per split: so many, a share in (0, 1], "sqrt", "log2"
+        or None for all.
+    random_state : where the trees' seeds come from; an integer gives the same trees at
+        every fit.
+    n_jobs : threads; None is 1, −1 is one per core. Never changes a result.
 
     Attributes
     ----------
-    forest_ : Forest
-        The fitted trees.
-    feature_importances_ : ndarray of shape (n_features_in_,)
-        Each feature's share of the variance that the splits remove (impurity-based).
-    n_features_in_ : int
-        Columns of X.
+    forest_ : the fitted trees, a `Forest`.
+    feature_importances_ : each feature's share of the variance that the splits remove.
+    n_features_in_ : columns of X.
     """
 
     _parameter_constraints: ClassVar[dict[str, list]] = {
@@ -106,37 +93,40 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
         threads = effective_n_jobs(self.n_jobs)
         if sample_weight is not None and multiplicity is not None:
             raise ValueError("sample_weight and multiplicity are the same: give one")
-        X, y = validate_data(
+        x: np.ndarray
+        x, y = validation.validate_data(
             self, X, y, dtype=np.float32, order="C", y_numeric=True, multi_output=False
         )
-        counts = _counts(X, sample_weight if multiplicity is None else multiplicity)
-        X, y = X[counts > 0], np.asarray(y, np.float64)[counts > 0]
-        counts = counts[counts > 0]
+        counts = _counts(x, sample_weight if multiplicity is None else multiplicity)
+        used = counts > 0
+        x, counts, target = x[used], counts[used], np.asarray(y, np.float64)[used]
         random, trees = check_random_state(self.random_state), self.n_estimators
         seeds = random.randint(0, 2**64, size=trees, dtype=np.uint64)
         most: Any = self.max_features
         if isinstance(most, str):
-            most = max(1, int(getattr(math, most)(X.shape[1])))
+            most = max(1, int(getattr(math, most)(x.shape[1])))
         elif most is not None and not isinstance(most, Integral):
-            most = max(1, int(most * X.shape[1]))
+            most = max(1, int(most * x.shape[1]))
         limits = self.min_samples_split, self.min_samples_leaf, most, self.max_depth
         parts = np.array_split(seeds, min(threads, trees))
-        tasks = [forest.Regression(X, y, part, counts) for part in parts]
+        tasks = [forest.Regression(x, target, part, counts) for part in parts]
         fits = forest.fit_forests(tasks, forest.TreeSettings(*limits), threads=threads)
         self.forest_ = forest.join([fit.forest for fit in fits if fit.forest])
-        self._data: tuple[np.ndarray, ...] = X, y, counts  # small beside the trees
+        self._data: tuple[np.ndarray, ...] = x, target, counts  # small beside the trees
         return self
 
     @property
     def feature_importances_(self) -> np.ndarray:
         """Each feature's share of the variance that the splits remove, (d,)."""
-        check_is_fitted(self)
+        validation.check_is_fitted(self)
         return forest.importances(self.forest_, *self._data)
 
     def predict(self, X: ArrayLike) -> np.ndarray:
         """Mean of the trees at X (n, d): (n,) float64."""
-        check_is_fitted(self)
-        x: np.ndarray = validate_data(self, X, dtype=np.float32, order="C", reset=False)
+        validation.check_is_fitted(self)
+        x: np.ndarray = validation.validate_data(
+            self, X, dtype=np.float32, order="C", reset=False
+        )
         threads = effective_n_jobs(self.n_jobs)
         parts = np.array_split(x, min(threads, len(x)))
         forests = [self.forest_] * len(parts)
@@ -145,7 +135,7 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
 
 def _counts(X: np.ndarray, weights: ArrayLike | None) -> np.ndarray:
     """How often each row counts, (n,) int64; ValueError for other weights."""
-    counts: np.ndarray = _check_sample_weight(weights, X, dtype=np.float64)
+    counts: np.ndarray = validation._check_sample_weight(weights, X, dtype=np.float64)
     wrong = (counts < 0) | (counts % 1 != 0)
     if wrong.any() or not 0 < counts.sum() < 2**40:
         raise ValueError(

@@ -9,8 +9,7 @@ Beyond scikit-learn: rows can have multiplicities, which count in everything as 
 many equal rows would; the training rows and given query rows are predicted while the
 trees grow; many forests are fitted in one call, on threads that cannot change a result.
 
-Precision: targets are rounded to multiples of about max|y| · rows · 2^−62 (relative to
-max|y| 7e-15 for 29 000 rows); all sums are then exact.
+Targets are rounded to multiples of about max|y| · rows · 2^−62; sums are then exact.
 """
 
 import os
@@ -160,8 +159,10 @@ def fit_forests(
     checked = [_checked(regression) for regression in regressions]
 
     def fit(arguments: tuple[np.ndarray, ...]) -> ForestFit:
-        *trees, fitted, queried = grow_forest(*arguments, tuple(limits), keep)
-        forest = Forest(*trees, arguments[0].shape[1]) if keep else None
+        grown = grow_forest(*arguments, tuple(limits), keep)
+        nodes, values, first, depths, fitted, queried = grown
+        d = arguments[0].shape[1]
+        forest = Forest(nodes, values, first, depths, d) if keep else None
         return ForestFit(forest, fitted, queried)
 
     return _spread(fit, checked, threads)

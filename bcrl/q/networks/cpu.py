@@ -1,15 +1,12 @@
 """DQN's update and forward pass compiled, a seed at a time: the CPU's way.
 
-Computes what `mlp` and `DQN`'s torch update compute with batched products, but
-one seed's parameters stay in the cache from the batch to Adam, no cost is paid by the
-call, and units that are off for a whole batch are left out of the products
-(`tiles`). A seed's floats don't depend on the others. A transition's bootstrap
-value is cached until the target network changes, so that a batch evaluates the target
-only at transitions that no batch has drawn since.
+The same as `mlp` and `DQN`'s torch update, but a seed's parameters stay in the cache,
+and units that are off for a whole batch are left out of the products (`tiles`). A
+seed's floats don't depend on the others. A transition's bootstrap value is cached until
+the target network changes.
 
 A layer's parameters, weights (in, out) and then biases, are one matrix (in + 1, out):
-the input of a layer has a row of ones. `outputs`, `renew_ahead` and
-`update` are the entry points.
+the input of a layer has a row of ones.
 """
 
 from typing import NamedTuple
@@ -74,7 +71,7 @@ def _relu(units, n_units, n, alive):
             units[k, b] = max(zero, units[k, b])
             most = max(most, units[k, b])
         alive[on] = k
-        on += most > zero
+        on += int(most > zero)
     return on
 
 
@@ -204,8 +201,7 @@ def outputs(flat, sizes, x):
     n_out = sizes[-1]
     out = np.empty((n_seeds, n, n_out), np.float32)
     room = space(sizes, n)
-    row = np.empty(sizes.max() + 1, np.float32)
-    values = np.empty_like(row)
+    row, values = np.empty((2, sizes.max() + 1), np.float32)
     for s in range(n_seeds):
         if n == 1:
             _outputs_at_one(flat[s], sizes, x[s, 0], row, values)
@@ -230,8 +226,7 @@ def renew(target, sizes, rows, bootstrap, valid, indices, layout, stale, room):
     """
     d, n_actions = layout
     n, last = 0, len(indices) - 1
-    for i in range(len(indices)):
-        place = indices[i]
+    for i, place in enumerate(indices):
         if not valid[place]:
             valid[place] = True
             for k in range(d):
@@ -280,23 +275,21 @@ def update(networks, sizes, replay, indices, layout, adam, states, loss, next_va
     rows, bootstrap, valid = replay
     n_seeds, n = indices.shape
     room, stale, one = space(sizes, n), np.empty(n, np.int64), np.float32(1.0)
-    row = np.empty(sizes.max() + 1, np.float32)
-    answer = np.empty_like(row)
+    row, answer = np.empty((2, sizes.max() + 1), np.float32)
     slopes, end = room.slopes[len(sizes) - 1], 2 * d + n_actions
     for s in range(n_seeds):
         held, value, fresh, drawn = rows[s], bootstrap[s], valid[s], indices[s]
         renew(target[s], sizes, held, value, fresh, drawn, layout, stale, room)
-        for b in range(n):
+        for b, place in enumerate(drawn):
             for i in range(d):
-                room.units[0, i, b] = held[drawn[b], i]
+                room.units[0, i, b] = held[place, i]
         values = forward(online[s], sizes, room, n)
         slopes[:n_actions] = np.float32(0.0)
         room.turned[:, :n_actions] = np.float32(0.0)
         total_loss = 0.0
-        for b in range(n):
-            packed = held[drawn[b]]
-            a = int(packed[end + 2])
-            y = packed[end] + packed[end + 1] * value[drawn[b]]
+        for b, place in enumerate(drawn):
+            packed, a = held[place], int(held[place, end + 2])
+            y = packed[end] + packed[end + 1] * value[place]
             error = values[a, b] - y
             clipped = one if error > one else -one if error < -one else error  # or nan
             room.turned[b, a] = slopes[a, b] = clipped / np.float32(n)
