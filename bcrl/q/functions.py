@@ -1,7 +1,5 @@
 """Action-value functions of several seeds at once, and sums of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -35,10 +33,7 @@ def each(states: Sequence[NDArray], values: Callable[[int], NDArray]) -> Values:
 
 
 def check_width(states: Sequence[NDArray], d: int) -> None:
-    """Raise BcrlError unless all states have the `d` entries that a Q was learned on.
-
-    Compiled code would read memory beside a shorter state.
-    """
+    """Raise BcrlError unless all states have `d` entries, as compiled code needs."""
     for width in {x.shape[-1] for x in states}:
         if width != d:
             raise BcrlError(

@@ -1,7 +1,5 @@
 """Q-functions quadratic in state and action: what LSPI learns in an LQ task."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -37,7 +35,7 @@ class Quadratic:
     @classmethod
     def from_weights(
         cls, theta: NDArray[np.float64], kind: str, m: int, actions: NDArray[np.float64]
-    ) -> Quadratic:
+    ) -> "Quadratic":
         """From the weights θ (S, F) of `features(z, kind)` for z of length m."""
         linear, products = np.zeros((len(theta), m)), theta
         if kind == "linear_quadratic":

@@ -7,14 +7,13 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch
-from numba import njit
 from threadpoolctl import threadpool_limits
 from torch.nn import functional
 
 from bcrl.common.seeding import stream
 from bcrl.learning.dqn_update import batched, one_by_one
 from bcrl.learning.replay import Replay
-from bcrl.q.networks import cpu, tiles
+from bcrl.q.networks import cpu
 from bcrl.q.networks.mlp import Adam, DeepQ, Networks, xavier
 
 D, A, BATCH = 4, 8, 32
@@ -99,10 +98,13 @@ def loss_of(online, target, rows):
 
 
 @WAYS
-@HIDDEN
-def test_gradients_and_adam_are_torchs(way, hidden):
-    seeds, steps = (0, 1, 5), 5
-    deep, replay, at = learner(hidden, seeds), filled(seeds), indices(seeds, steps)
+@pytest.mark.parametrize(
+    ("hidden", "batch"), [((128, 128), BATCH), ((64,), 19), ((33, 20, 7), 70)]
+)
+def test_gradients_and_adam_are_torchs(way, hidden, batch):
+    seeds, steps = (0, 1, 5), 10
+    deep, replay = learner(hidden, seeds), filled(seeds)
+    at = indices(seeds, steps, batch=batch)
     single = [(module(deep.online, s), module(deep.target, s)) for s in range(3)]
     adams = [
         torch.optim.Adam(one.parameters(), 1e-4, betas=(0.9, 0.999), eps=1e-8)
@@ -156,52 +158,30 @@ def test_an_update_uses_the_current_target_and_the_current_rows(way):
 
 @HIDDEN
 def test_the_stacked_forward_pass_is_torchs(hidden):
-    many, x = networks(hidden, (0, 3)), torch.randn(2, 7, D, generator=_generator())
+    many, rng = networks(hidden, (0, 3)), torch.Generator().manual_seed(0)
+    x, sizes = torch.randn(2, 7, D, generator=rng), np.array(many.sizes)
+    compiled = cpu.outputs(many.flat.numpy(), sizes, x.numpy())
     for s in range(2):
-        expected = module(many, s)(x[s])
+        expected = module(many, s)(x[s]).detach()
         assert torch.allclose(many.forward(x)[s], expected, atol=1e-5)
-        sizes = np.array(many.sizes)
-        found = cpu.outputs(many.flat.numpy(), sizes, x.numpy())[s]
-        assert np.allclose(found, expected.detach(), atol=1e-5)
-
-
-def _generator():
-    return torch.Generator().manual_seed(0)
-
-
-@pytest.mark.parametrize("batch", [BATCH, 19, 70])
-@HIDDEN
-def test_both_ways_agree_over_fifty_steps(hidden, batch):
-    seeds = (0, 1, 2)
-    replay, at = filled(seeds), indices(seeds, 50, batch=batch)
-    one, other = learner(hidden, seeds, 1e-3), learner(hidden, seeds, 1e-3)
-    ways = batched(one, replay), one_by_one(other, replay)
-    began = one.online.flat.clone()
-    for step in range(50):
-        losses = [losses_of(way, at[step]) for way in ways]
-        assert np.allclose(*losses, rtol=1e-3)
-    assert (one.online.flat - began).abs().mean() > 1e-3
-    assert (one.online.flat - other.online.flat).abs().max() < 1e-4
-    assert (one.online.flat - other.online.flat).abs().mean() < 1e-6
+        assert np.allclose(compiled[s], expected, atol=1e-5)
 
 
 @WAYS
 @HIDDEN
 def test_stacking_changes_no_bit(way, hidden):
-    seeds, steps = (3, 4, 5, 6, 7), 20
-    many, replay, at = learner(hidden, seeds), filled(seeds), indices(seeds, steps)
-    update = way(many, replay)
-    losses = np.array([losses_of(update, at[step]) for step in range(steps)])
+    def trained(seeds):
+        deep, at = learner(hidden, seeds), indices(seeds, 20)
+        update = way(deep, filled(seeds))
+        losses = np.array([losses_of(update, now) for now in at])
+        return losses, deep.online.flat, deep.optimiser.moments
+
+    losses, flat, moments = trained((3, 4, 5, 6, 7))
     for s in (0, 3):
-        alone = learner(hidden, seeds[s : s + 1])
-        update = way(alone, filled(seeds[s : s + 1]))
-        own = np.array(
-            [losses_of(update, at[step, s : s + 1]) for step in range(steps)]
-        )
+        own, one, of_one = trained((3 + s,))
         assert np.array_equal(own[:, 0], losses[:, s])
-        assert torch.equal(alone.online.flat[0], many.online.flat[s])
-        moments = alone.optimiser.moments[:, 0], many.optimiser.moments[:, s]
-        assert torch.equal(*moments)
+        assert torch.equal(one[0], flat[s])
+        assert torch.equal(of_one[:, 0], moments[:, s])
 
 
 @HIDDEN
@@ -241,50 +221,33 @@ def test_a_gradient_that_is_no_number_is_seen_in_the_weights(way):
     assert deep.online.flat[1].isnan().any()
 
 
-@njit
-def adam(to, gradient):
-    """A step of Adam on arrays (1, n): the gradient is a product of one term."""
-    one, only = np.ones(1, np.float32), np.zeros(1, np.int64)
-    n = to[0].shape[1]
-    tiles.product_adam(to, n, only, 1, only, 1, one, 0, 0, gradient)
-
-
-def test_faded_moments_become_zero_and_not_denormal():
-    smallest, n = np.finfo(np.float32).tiny, 50
-    rng = np.random.default_rng(0)
-    parameters = rng.standard_normal((1, n)).astype(np.float32)
-    first, second = np.zeros((2, 1, n), np.float32)
+@pytest.mark.parametrize("n", [50, 64, 150])
+def test_adam_is_the_papers_and_faded_moments_become_zero(n):
+    smallest, rng = np.finfo(np.float32).tiny, np.random.default_rng(0)
+    parameters = rng.standard_normal(n).astype(np.float32)
+    first, second = np.zeros((2, n), np.float32)
     optimiser = Adam.of(torch.zeros(1, n), 1e-4)
-    exact = [parameters.astype(float), np.zeros((1, n)), np.zeros((1, n))]
-    gradient = np.zeros((1, 64), np.float32)  # tiles read beyond n
-    gradient[:, :n] = 10.0 ** rng.uniform(-14, 0, n)
-    nothing = np.zeros_like(gradient)
+    x, m, v = parameters.astype(float), np.zeros(n), np.zeros(n)
+    gradient = (10.0 ** rng.uniform(-14, 0, n)).astype(np.float32)
     for step in range(1, 3001):
-        now = gradient if step <= 3 else nothing
-        beta1, beta2, *others = optimiser.next_step()
-        constants = (beta1, 1 - beta1, beta2, 1 - beta2, *others)
-        adam((parameters, first, second, *constants), now)
+        now = gradient if step <= 3 else np.zeros_like(gradient)
+        cpu.step_of_adam(parameters, first, second, now, optimiser.next_step())
         for moment in (first, second):
             assert not ((moment != 0) & (np.abs(moment) < smallest)).any()
-        exact[1] = 0.9 * exact[1] + 0.1 * now[:, :n]
-        exact[2] = 0.999 * exact[2] + 0.001 * now[:, :n].astype(float) ** 2
-        scaled = exact[1] / (1.0 - 0.9**step)
-        spread = np.sqrt(exact[2] / (1.0 - 0.999**step))
-        exact[0] = exact[0] - 1e-4 * scaled / (spread + 1e-8)
+        m, v = 0.9 * m + 0.1 * now, 0.999 * v + 0.001 * now.astype(float) ** 2
+        spread = np.sqrt(v / (1.0 - 0.999**step)) + 1e-8
+        x -= 1e-4 * m / (1.0 - 0.9**step) / spread
     assert not first.any()
-    assert np.abs(parameters - exact[0]).max() < 1e-6
+    assert np.abs(parameters - x).max() < 1e-6
 
 
 def test_a_deep_q_answers_stacked_and_listed_states_alike():
     deep = learner((32, 32), (0, 1))
     states = np.random.default_rng(0).standard_normal((2, 9, D))
-    stacked = deep(states, A)
-    listed = deep([states[0], states[1, :4]], A)
+    stacked, listed = deep(states, A), deep([states[0], states[1, :4]], A)
     assert stacked.dtype == np.float64 and stacked.shape == (2, 9, A)
-    assert np.allclose(stacked[0], listed[0], atol=1e-6)
-    assert np.allclose(stacked[1, :4], listed[1], atol=1e-6)
-    expected = module(deep.online, 1)(torch.from_numpy(states[1]).float())
-    assert np.allclose(stacked[1], expected.detach(), atol=1e-5)
+    for one, other in zip((stacked[0], stacked[1, :4]), listed, strict=True):
+        assert np.allclose(one, other, atol=1e-6)
 
 
 def test_a_clone_trains_on_its_own():

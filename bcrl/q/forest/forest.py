@@ -9,39 +9,35 @@ Beyond scikit-learn: rows can have multiplicities, which count in everything as 
 many equal rows would; the training rows and given query rows are predicted while the
 trees grow; many forests are fitted in one call, on threads that cannot change a result.
 
-Precision: targets are rounded to multiples of about max|y| · rows · 2^−62 (relative to
-max|y| 7e-15 for 29 000 rows); all sums are then exact.
+Targets are rounded to multiples of about max|y| · rows · 2^−62; sums are then exact.
 """
-
-from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import cache
 from itertools import pairwise
 
 import numpy as np
 
-from bcrl.errors import BcrlError, ConfigError
-from bcrl.q.forest.grow import grow_forest
-from bcrl.q.forest.predict import predict_forest
-
-_UNLIMITED = 2**62
+from bcrl.errors import BcrlError, at_least
+from bcrl.q.forest.trees import grow_forest, predict_forest
 
 
 @dataclass(frozen=True)
 class TreeSettings:
-    """scikit-learn's parameters of the same names.
-
-    max_features None: all features are tried; max_depth None: no limit.
-    """
+    """scikit-learn's parameters of the same names; None is no limit."""
 
     min_samples_split: int = 2
     min_samples_leaf: int = 1
     max_features: int | None = None
     max_depth: int | None = None
+
+    def __post_init__(self) -> None:
+        at_least("min_samples_split", self.min_samples_split, 2)
+        for name in ("min_samples_leaf", "max_features", "max_depth"):
+            at_least(name, getattr(self, name), 1)
 
 
 @dataclass
@@ -157,16 +153,15 @@ def fit_forests(
     """Fit one forest per regression; neither `threads` nor the others change it.
 
     keep: whether the trees are stored; predictions come with each result either way.
-    Raises ConfigError for settings, BcrlError for data that no forest can be fitted to.
+    Raises BcrlError for data that no forest can be fitted to.
     """
-    min_split, min_leaf, most, deepest = _limits(settings)
+    limits = [2**62 if x is None else int(x) for x in astuple(settings)]
     checked = [_checked(regression) for regression in regressions]
 
     def fit(arguments: tuple[np.ndarray, ...]) -> ForestFit:
+        grown = grow_forest(*arguments, tuple(limits), keep)
+        nodes, values, first, depths, fitted, queried = grown
         d = arguments[0].shape[1]
-        limits = (min_split, min_leaf, min(most, d), deepest)
-        *trees, fitted, queried = grow_forest(*arguments, limits, keep)
-        nodes, values, first, depths = trees
         forest = Forest(nodes, values, first, depths, d) if keep else None
         return ForestFit(forest, fitted, queried)
 
@@ -183,8 +178,7 @@ def predict_forests(
 
 def _spread(function: Callable, items: Sequence, threads: int) -> list:
     """The results of `function` for all items, on up to `threads` threads."""
-    if threads < 1:
-        raise ConfigError("threads", threads, "must be at least 1")
+    at_least("threads", threads, 1)
     threads = min(threads, len(items), 4 * (os.cpu_count() or 1))
     if threads <= 1:
         return [function(item) for item in items]
@@ -197,31 +191,12 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads)
 
 
-def _limits(settings: TreeSettings) -> tuple[int, ...]:
-    """The checked settings as the compiled code takes them."""
-    found = []
-    for name, least in (
-        ("min_samples_split", 2),
-        ("min_samples_leaf", 1),
-        ("max_features", 1),
-        ("max_depth", 1),
-    ):
-        value = getattr(settings, name)
-        if value is None and name.startswith("max"):
-            value = _UNLIMITED
-        if not isinstance(value, int | np.integer) or value < least:
-            raise ConfigError(name, value, f"must be an integer of at least {least}")
-        found.append(int(value))
-    return tuple(found)
-
-
 def _points(name: str, x: np.ndarray, d: int | None = None) -> np.ndarray:
     """`x` as finite (n, d) float32 in C order, uncopied if it is that already."""
     x = np.ascontiguousarray(x, np.float32)
-    if x.ndim != 2 or x.shape[1] < 1 or (d is not None and x.shape[1] != d):
-        raise BcrlError(
-            f"{name} has shape {x.shape}, expected (rows, {d or 'features'})"
-        )
+    if x.ndim != 2 or x.shape[1] < 1 or (d or x.shape[1]) != x.shape[1]:
+        expected = f"expected (rows, {d or 'features'})"
+        raise BcrlError(f"{name} has shape {x.shape}, {expected}")
     if not np.isfinite(x).all():
         raise BcrlError(f"{name} holds NaN, infinity or values too large for float32")
     return x
@@ -238,15 +213,12 @@ def _checked(regression: Regression) -> tuple[np.ndarray, ...]:
         raise BcrlError("y holds NaN or infinity")
     if seeds.ndim != 1 or len(seeds) < 1:
         raise BcrlError(f"tree_seeds has shape {seeds.shape}, expected one per tree")
-    counts = np.empty(0, np.int64)  # all rows count once
+    counts, queries = np.empty(0, np.int64), x[:0]  # all rows count once
     if regression.multiplicity is not None:
         counts = np.ascontiguousarray(regression.multiplicity, np.int64)
         if counts.shape != y.shape or counts.min() < 1 or counts.sum() >= 2**40:
-            raise BcrlError(
-                f"multiplicity must be ({len(x)},) integers of at least 1, below 2^40 "
-                "in all"
-            )
-    queries = x[:0]
+            why = f"must be ({len(x)},) integers of at least 1, below 2^40 in all"
+            raise BcrlError(f"multiplicity {why}")
     if regression.queries is not None:
         queries = _points("queries", regression.queries, x.shape[1])
     return x, y, counts, seeds, queries

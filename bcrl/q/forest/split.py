@@ -1,20 +1,11 @@
 """Compiled parts of the forest: keys, random cuts and the choice of a split.
 
-Three representations make the loops fast and the results exact:
-
-* features are **keys**, integers ordered like the float32 values they stand for, so
-  that comparisons and minima are integer operations, which vectorise;
-* targets are **fixed-point** int64, so that sums are exact and independent of the order
-  of rows, of the vector width and of the machine (sums of floats are none of these);
-* the rows of a node lie side by side, a row's keys next to each other (`buffers`).
-
-Because sums are exact, a row of multiplicity 3 and three equal rows give the same tree
-bit for bit, and so does any order of the rows.
-
-Indices are unsigned because numba checks signed ones for being negative.
+Features are **keys**, integers ordered like the float32 values they stand for, so that
+comparisons vectorise. Targets are **fixed-point** int64, so that sums are exact and do
+not depend on the order of rows or on the machine: a row of multiplicity 3 and three
+equal rows give the same tree bit for bit. A row's keys lie next to each other
+(`trees.Rows`). Indices are unsigned: numba checks whether signed ones are negative.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
@@ -38,9 +29,8 @@ GOLDEN, LOW32 = U(0x9E3779B97F4A7C15), U(0xFFFFFFFF)
 SIGN, REST = np.int32(31), np.int32(0x7FFFFFFF)
 HALF = np.int64(32)  # bits of a key in a word
 
-
-#: Functions that neither make nor keep arrays need no reference counting, which costs
-#: more than the work in a small node.
+#: Functions that make no arrays need no reference counting, which costs more than the
+#: work in a small node.
 uncounted: Callable[[Callable], Callable] = partial(njit, _nrt=False)()
 #: The same, inlined into the caller, because passing arrays costs as much again.
 inlined: Callable[[Callable], Callable] = partial(njit, _nrt=False, inline="always")()
@@ -95,8 +85,7 @@ class Split(NamedTuple):
 def is_pure(target, weight, start, stop, total_weight, unit):
     """Whether the variance of the targets at `start:stop` is at most PURE.
 
-    Two rows at a distance δ alone give a variance of δ² / (2 · total weight) or more:
-    a mixed node is recognised after a row or two.
+    Two rows at a distance δ alone give a variance of at least δ² / (2 · total weight).
     """
     first = target[start]
     limit = 2.0 * total_weight * PURE

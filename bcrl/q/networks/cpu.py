@@ -1,18 +1,13 @@
 """DQN's update and forward pass compiled, a seed at a time: the CPU's way.
 
-Computes what `mlp` and `DQN`'s torch update compute with batched products, but
-one seed's parameters stay in the cache from the batch to Adam, no cost is paid by the
-call, and units that are off for a whole batch are left out of the products
-(`tiles`). A seed's floats don't depend on the others. A transition's bootstrap
-value is cached until the target network changes, so that a batch evaluates the target
-only at transitions that no batch has drawn since.
+The same as `mlp` and `DQN`'s torch update, but a seed's parameters stay in the cache,
+and units that are off for a whole batch are left out of the products (`tiles`). A
+seed's floats don't depend on the others. A transition's bootstrap value is cached until
+the target network changes.
 
 A layer's parameters, weights (in, out) and then biases, are one matrix (in + 1, out):
-the input of a layer has a row of ones. `outputs`, `renew_ahead` and
-`update` are the entry points.
+the input of a layer has a row of ones.
 """
-
-from __future__ import annotations
 
 from typing import NamedTuple
 
@@ -21,11 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.common.compiling import kept
-from bcrl.q.networks import tiles
-from bcrl.q.networks.tiles import LANES, WIDTH, padded
+from bcrl.q.networks.tiles import WIDTH, product
 
+#: Moments up to this size become 0: a dead unit's would fade into denormal numbers, on
+#: which processors are many times slower.
+FADED = 1e-30
+#: For Adam's division and square root. An infinite weight may turn into one that is not
+#: a number ("ninf"), and that stays one (no "nnan"): either is found.
+_FAST = {"reassoc", "nsz", "arcp", "contract", "afn", "ninf"}
+_BLOCK = 64  # floats that every processor's vectors divide
 _AHEAD = 64  # rows per forward pass of the target network in `renew_ahead`
 _compiled = numba.njit(nogil=True, error_model="numpy")
+_compiled_fast = numba.njit(nogil=True, error_model="numpy", fastmath=_FAST)
 _entry_point = kept(nogil=True, error_model="numpy")
 
 
@@ -38,61 +40,111 @@ class Room(NamedTuple):
     units: NDArray[np.float32]  # (L + 1, widest + 1, n): inputs, activations, outputs
     slopes: NDArray[np.float32]  # the same of ∂loss/∂(what a ReLU is given)
     turned: NDArray[np.float32]  # (n, widest): one layer's slopes, transposed
+    gradient: NDArray[np.float32]  # of one layer's parameters, flat
     alive: NDArray[np.int64]  # (L, widest + 1): units on in some column, then the ones
-    dead: NDArray[np.int64]  # (L, widest + 1): the other units
     n_alive: NDArray[np.int64]  # (L,): how many are on
-    some: NDArray[np.int32]  # (widest,): not 0 if the unit is on in some column
     all: NDArray[np.int64]  # (widest or n,): all units of a layer, or columns
 
 
 @_compiled
 def space(sizes, n):
     """Room for up to `n` inputs."""
-    layers, widest = len(sizes), sizes.max()
-    shape = (layers, padded(widest + 1, LANES), padded(n, WIDTH))
+    layers, widest, wide = len(sizes), sizes.max(), n + WIDTH
     return Room(
-        np.zeros(shape, np.float32),
-        np.zeros(shape, np.float32),
-        np.zeros((padded(n, LANES), padded(widest, WIDTH)), np.float32),
-        np.zeros((layers, widest + 1), np.int64),
+        np.zeros((layers, widest + 1, wide), np.float32),
+        np.zeros((layers, widest + 1, wide), np.float32),
+        np.zeros((n, widest + WIDTH), np.float32),
+        np.empty((widest + 1) * widest + WIDTH, np.float32),
         np.zeros((layers, widest + 1), np.int64),
         np.zeros(layers, np.int64),
-        np.zeros(widest, np.int32),
         np.arange(max(n, widest)),
     )
+
+
+@_compiled
+def _relu(units, n_units, n, alive):
+    """Put a layer's units through a ReLU; list those on in some column, count them."""
+    on, zero = 0, np.float32(0.0)
+    for k in range(n_units):
+        most = zero
+        for b in range(n):
+            units[k, b] = max(zero, units[k, b])
+            most = max(most, units[k, b])
+        alive[on] = k
+        on += int(most > zero)
+    return on
 
 
 @_compiled
 def forward(flat, sizes, room, n):
     """Outputs (n_out, n) of one seed's network at the n inputs in room.units[0]."""
     at, last = 0, len(sizes) - 2
-    room.some[:] = 1
     for layer in range(last + 1):
         n_in, n_out = sizes[layer], sizes[layer + 1]
         before, after = room.units[layer], room.units[layer + 1]
-        before[n_in] = np.float32(1.0)
-        alive, dead, m = room.alive[layer], room.dead[layer], 0
-        for k in range(n_in):  # written to both lists; the next unit overwrites one
-            alive[m] = dead[k - m] = k
-            m += room.some[k] != 0
-        alive[m] = n_in
-        room.n_alive[layer] = m
-        shape = (n, room.all, n_out, alive, m + 1)
-        factors = (flat[at:], 1, n_out, before)
-        if layer < last:
-            room.some[:] = 0
-            tiles.product_relu((after, room.some), *shape, *factors)
+        alive, m = room.alive[layer], n_in
+        if layer:
+            m = _relu(before, n_in, n, alive)
         else:
-            tiles.product((after,), *shape, *factors)
+            alive[:n_in] = room.all[:n_in]
+        before[n_in], alive[m], room.n_alive[layer] = np.float32(1.0), n_in, m
+        factors = (alive, m + 1, flat[at:], 1, n_out, before)
+        product(after, n, room.all, n_out, *factors)
         at += (n_in + 1) * n_out
     return room.units[last + 1]
 
 
+@_compiled_fast
+def _adam(parameters, first, second, gradient, adam):
+    """`step_of_adam` for arrays whose length is a multiple of _BLOCK."""
+    zero, least = np.float32(0.0), np.float32(FADED)
+    rest1, rest2 = np.float32(1.0 - adam[0]), np.float32(1.0 - adam[1])
+    beta1, beta2 = np.float32(adam[0]), np.float32(adam[1])
+    rate, scale, eps = np.float32(adam[2]), np.float32(adam[3]), np.float32(adam[4])
+    for i in range(len(parameters)):
+        g = gradient[i]
+        m = beta1 * first[i] + rest1 * g
+        v = beta2 * second[i] + rest2 * g * g
+        m = zero if abs(m) <= least else m
+        v = zero if v <= least else v
+        first[i], second[i] = m, v
+        parameters[i] -= rate * m / (np.sqrt(v) * scale + eps)
+
+
 @_compiled
-def backward(flat, first, second, sizes, room, n, constants):
+def step_of_adam(parameters, first, second, gradient, adam):
+    """Adam's step (Kingma and Ba 2015, algorithm 1) on arrays (P,), in place.
+
+    The last floats are rounded like the others: they go through the same vectors.
+    """
+    n, whole = len(parameters), len(parameters) // _BLOCK * _BLOCK
+    _adam(parameters[:whole], first[:whole], second[:whole], gradient, adam)
+    if whole < n:
+        rest = np.zeros((4, _BLOCK), np.float32)
+        arrays = parameters, first, second, gradient
+        for i in range(4):
+            rest[i, : n - whole] = arrays[i][whole:n]
+        _adam(rest[0], rest[1], rest[2], rest[3], adam)
+        for i in range(3):
+            arrays[i][whole:] = rest[i, : n - whole]
+
+
+@_compiled
+def _mask_and_turn(slopes, units, n_units, n, turned):
+    """Zero the slopes where their units are off; also transpose them."""
+    zero = np.float32(0.0)
+    for k in range(n_units):
+        for b in range(n):
+            slopes[k, b] = slopes[k, b] if units[k, b] > zero else zero
+        for b in range(n):
+            turned[b, k] = slopes[k, b]
+
+
+@_compiled
+def backward(flat, first, second, sizes, room, n, adam):
     """A step of Adam on one seed's network (P,), after `forward` at n inputs.
 
-    first, second (P,): moments; constants: what Adam's finish wants; room.turned holds
+    first, second (P,): moments; adam: from `Adam.next_step`; room.turned holds
     ∂loss/∂output, and so does the last of room.slopes.
     """
     at, last = len(flat), len(sizes) - 2
@@ -102,32 +154,23 @@ def backward(flat, first, second, sizes, room, n, constants):
         end, at = at, at - (n_in + 1) * n_out
         before, alive, m = room.units[layer], room.alive[layer], room.n_alive[layer]
         slopes, below = room.slopes[layer + 1], room.slopes[layer]
-        weights = flat[at:end]
         if layer:  # through the weights as they were in `forward`
-            factors = (weights, n_out, 1, slopes)
-            tiles.product((below,), n, alive, m, above, n_above, *factors)
-        shape = (n_in + 1, n_out)
-        moments = first[at:end].reshape(shape), second[at:end].reshape(shape)
-        to = (weights.reshape(shape), *moments, *constants)
-        factors = (before.reshape(-1), before.shape[1], 1, room.turned)
-        tiles.product_adam(to, n_out, alive, m + 1, room.all, n, *factors)
-        dead = room.dead[layer]
-        tiles.product_adam(to, n_out, dead, n_in - m, room.all, 0, *factors)
+            factors = (above, n_above, flat[at:end], n_out, 1, slopes)
+            product(below, n, alive, m, *factors)
+        factors = (room.all, n, before.reshape(-1), before.shape[1], 1, room.turned)
+        gradient = room.gradient[: end - at].reshape(n_in + 1, n_out)
+        product(gradient, n_out, alive, m + 1, *factors)
+        passed = 0
+        for k in range(n_in):
+            if alive[passed] == k:
+                passed += 1
+            else:
+                gradient[k] = np.float32(0.0)
+        own = flat[at:end], first[at:end], second[at:end]
+        step_of_adam(*own, room.gradient, adam)
         if layer:
-            for column in range(0, n, LANES):
-                for row in range(0, n_in, LANES):
-                    tiles.turn(below, before, room.turned, row, column)  # type: ignore[call-arg]
+            _mask_and_turn(below, before, n_in, n, room.turned)
         above, n_above = alive, m
-
-
-@_compiled
-def row_times(row, weights, out):
-    """row (in,) · weights (in, out)."""
-    out[:] = np.float32(0.0)
-    for k in range(len(row)):
-        if row[k] != 0:  # as behind a ReLU that is off
-            for j in range(len(out)):
-                out[j] += row[k] * weights[k, j]
 
 
 @_compiled
@@ -140,13 +183,15 @@ def _outputs_at_one(flat, sizes, state, row, out):
     row[: sizes[0]] = state
     for layer in range(last + 1):
         n_in, n_out = sizes[layer], sizes[layer + 1]
-        end = at + (n_in + 1) * n_out
-        row[n_in] = np.float32(1.0)
-        row_times(row[: n_in + 1], flat[at:end].reshape(n_in + 1, n_out), out[:n_out])
+        row[n_in], out[:n_out] = np.float32(1.0), np.float32(0.0)
+        for k in range(n_in + 1):
+            if row[k] != 0:  # as behind a ReLU that is off
+                for j in range(n_out):
+                    out[j] += row[k] * flat[at + j]
+            at += n_out
         if layer < last:
             for j in range(n_out):
                 row[j] = max(out[j], np.float32(0.0))
-        at = end
 
 
 @_entry_point
@@ -156,8 +201,7 @@ def outputs(flat, sizes, x):
     n_out = sizes[-1]
     out = np.empty((n_seeds, n, n_out), np.float32)
     room = space(sizes, n)
-    row = np.empty(sizes.max() + 1, np.float32)
-    values = np.empty_like(row)
+    row, values = np.empty((2, sizes.max() + 1), np.float32)
     for s in range(n_seeds):
         if n == 1:
             _outputs_at_one(flat[s], sizes, x[s, 0], row, values)
@@ -182,8 +226,7 @@ def renew(target, sizes, rows, bootstrap, valid, indices, layout, stale, room):
     """
     d, n_actions = layout
     n, last = 0, len(indices) - 1
-    for i in range(len(indices)):
-        place = indices[i]
+    for i, place in enumerate(indices):
         if not valid[place]:
             valid[place] = True
             for k in range(d):
@@ -230,32 +273,28 @@ def update(networks, sizes, replay, indices, layout, adam, states, loss, next_va
     d, n_actions = layout
     online, target, moments = networks
     rows, bootstrap, valid = replay
-    beta1, beta2, rate, scale, eps = adam
-    constants = (beta1, 1.0 - beta1, beta2, 1.0 - beta2, rate, scale, eps)
     n_seeds, n = indices.shape
     room, stale, one = space(sizes, n), np.empty(n, np.int64), np.float32(1.0)
-    row = np.empty(sizes.max() + 1, np.float32)
-    answer = np.empty_like(row)
+    row, answer = np.empty((2, sizes.max() + 1), np.float32)
     slopes, end = room.slopes[len(sizes) - 1], 2 * d + n_actions
     for s in range(n_seeds):
         held, value, fresh, drawn = rows[s], bootstrap[s], valid[s], indices[s]
         renew(target[s], sizes, held, value, fresh, drawn, layout, stale, room)
-        for b in range(n):
+        for b, place in enumerate(drawn):
             for i in range(d):
-                room.units[0, i, b] = held[drawn[b], i]
+                room.units[0, i, b] = held[place, i]
         values = forward(online[s], sizes, room, n)
         slopes[:n_actions] = np.float32(0.0)
         room.turned[:, :n_actions] = np.float32(0.0)
         total_loss = 0.0
-        for b in range(n):
-            packed = held[drawn[b]]
-            a = int(packed[end + 2])
-            y = packed[end] + packed[end + 1] * value[drawn[b]]
+        for b, place in enumerate(drawn):
+            packed, a = held[place], int(held[place, end + 2])
+            y = packed[end] + packed[end + 1] * value[place]
             error = values[a, b] - y
             clipped = one if error > one else -one if error < -one else error  # or nan
             room.turned[b, a] = slopes[a, b] = clipped / np.float32(n)
             total_loss += clipped * (error - np.float32(0.5) * clipped)
         loss[s] = total_loss / n
-        backward(online[s], moments[0, s], moments[1, s], sizes, room, n, constants)
+        backward(online[s], moments[0, s], moments[1, s], sizes, room, n, adam)
         _outputs_at_one(online[s], sizes, states[s], row, answer)
         next_values[s] = answer[:n_actions]

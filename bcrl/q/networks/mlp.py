@@ -4,8 +4,6 @@ This module runs on any device. On a CPU, the module `cpu` computes the same fas
 compiled code; `DeepQ` and the DQN update choose by the device of the parameters.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence
@@ -17,7 +15,7 @@ from numpy.typing import NDArray
 
 from bcrl.common.serialization import DERIVED, storable
 from bcrl.q.functions import Values, check_width, each
-from bcrl.q.networks import cpu, tiles
+from bcrl.q.networks import cpu
 
 Tensor = torch.Tensor
 
@@ -56,19 +54,14 @@ class Networks:
     )
 
     def __post_init__(self) -> None:
-        self.layers = self._views(self.flat)
-
-    def _views(self, flat: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """(weights (S, in, out), biases (S, 1, out)) of each layer, inside `flat`."""
-        views, at = [], 0
+        self.layers, at = [], 0  # weights (S, in, out) and biases (S, 1, out) in `flat`
         for n_in, n_out in itertools.pairwise(self.sizes):
             end = at + n_in * n_out
-            weights = flat[:, at:end].view(-1, n_in, n_out)
-            views.append((weights, flat[:, end : end + n_out].unsqueeze(1)))
+            weights = self.flat[:, at:end].view(-1, n_in, n_out)
+            self.layers.append((weights, self.flat[:, None, end : end + n_out]))
             at = end + n_out
-        return views
 
-    def clone(self) -> Networks:
+    def clone(self) -> "Networks":
         """Networks with copies of the parameters."""
         return Networks(self.sizes, self.flat.clone())
 
@@ -78,15 +71,12 @@ class Networks:
         if n not in self._buffers:
             widths = self.sizes[1:]
             self._buffers[n] = [x.new_empty((x.shape[0], n, w)) for w in widths]
-        activations = self._buffers[n]
-        last = len(self.layers) - 1
         for layer, (weights, biases) in enumerate(self.layers):
-            x = torch.baddbmm(biases, x, weights, out=activations[layer])
-            if layer < last:
-                x.relu_()
+            x = x.relu_() if layer else x
+            x = torch.baddbmm(biases, x, weights, out=self._buffers[n][layer])
         return x
 
-    def backward(self, x: Tensor, slope: Tensor, gradient: Networks) -> None:
+    def backward(self, x: Tensor, slope: Tensor, gradient: "Networks") -> None:
         """Write ∂loss/∂parameters into `gradient`, given slope = ∂loss/∂output.
 
         `slope` (S, n, out) belongs to the latest `forward(x)` with x (S, n, in).
@@ -103,12 +93,8 @@ class Networks:
             if layer:
                 onward = self.layers[layer][0].transpose(1, 2)
                 slope = torch.bmm(slope, onward, out=spare[layer - 1])
-                _mask(slope, before)
-
-
-def _mask(slope: Tensor, activation: Tensor) -> None:
-    """Zero the slope where the ReLU was off, in place."""
-    torch.ops.aten.threshold_backward.grad_input(slope, activation, 0, grad_input=slope)
+                off = torch.ops.aten.threshold_backward.grad_input  # of the ReLU
+                off(slope, before, 0, grad_input=slope)
 
 
 @storable
@@ -123,11 +109,11 @@ class Adam:
     steps: int = 0
 
     @classmethod
-    def of(cls, parameters: Tensor, rate: float) -> Adam:
+    def of(cls, parameters: Tensor, rate: float) -> "Adam":
         """For parameters (S, P) that have not been trained."""
         return cls(parameters.new_zeros((2, *parameters.shape)), rate)
 
-    def clone(self) -> Adam:
+    def clone(self) -> "Adam":
         """The same step count and copies of the moments."""
         return replace(self, moments=self.moments.clone())
 
@@ -145,8 +131,8 @@ class Adam:
         first, second = self.moments
         first.lerp_(gradient, 1.0 - b1)
         second.mul_(b2).addcmul_(gradient, gradient, value=1.0 - b2)
-        first.masked_fill_(first.abs() < tiles.FADED, 0.0)
-        second.masked_fill_(second < tiles.FADED, 0.0)
+        first.masked_fill_(first.abs() < cpu.FADED, 0.0)
+        second.masked_fill_(second < cpu.FADED, 0.0)
         parameters.addcdiv_(first, second.sqrt().mul_(scale).add_(eps), value=-rate)
 
 
@@ -164,10 +150,8 @@ class DeepQ:
         check_width(states, self.online.sizes[0])
         if isinstance(states, np.ndarray):
             return self._values(self.online, states)
-        one = [
-            Networks(self.online.sizes, self.online.flat[s : s + 1])
-            for s in range(len(states))
-        ]
+        sizes, rows = self.online.sizes, self.online.flat.split(1)
+        one = [Networks(sizes, row) for row in rows]
         return each(states, lambda s: self._values(one[s], states[s][None])[0])
 
     def _values(self, networks: Networks, x: NDArray) -> NDArray[np.float64]:
@@ -179,7 +163,7 @@ class DeepQ:
         values = networks.forward(torch.from_numpy(inputs).to(flat.device))
         return values.cpu().numpy().astype(np.float64)
 
-    def clone(self) -> DeepQ:
+    def clone(self) -> "DeepQ":
         """A copy that may be trained on without changing this one."""
         online, target = self.online.clone(), self.target.clone()
         return DeepQ(online, target, self.optimiser.clone(), self.steps)

@@ -1,7 +1,5 @@
 """The regression problems of fitted Q-iteration, their fits, and a Q made of fits."""
 
-from __future__ import annotations
-
 import textwrap
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -50,9 +48,9 @@ class Fit:
 class Regressor(Protocol):
     """Fits many problems at once; its constructor's arguments are its YAML keys.
 
-    finite_only: whether it needs an environment with finitely many states. A regressor
-    may also set `pointwise = True`: then no prediction depends, to the last bit, on the
-    other points of the call, and predictions may be cached.
+    finite_only: whether it needs an environment with finitely many states. It may set
+    `pointwise = True` if no prediction depends, to the last bit, on the other points of
+    a call; then predictions may be cached.
     """
 
     finite_only: bool
@@ -75,7 +73,7 @@ class Fitted:
     model: Any = field(default=None, metadata=DERIVED)
 
     @classmethod
-    def of(cls, problem: Problem, fit: Fit) -> Fitted:
+    def of(cls, problem: Problem, fit: Fit) -> "Fitted":
         """The model of a fit, without the fit's predictions."""
         return cls(replace(problem, queries=problem.queries[:0]), fit.model)
 
@@ -130,8 +128,7 @@ def _copied(problem: Problem) -> Problem:
 
 def _check_shape(values: Any, n: int) -> None:
     """Raise BcrlError unless there are n predictions."""
-    if np.shape(values) != (n,):
-        shape = np.shape(values)
+    if (shape := np.shape(values)) != (n,):
         raise BcrlError(f"predictions have the shape {shape}, expected ({n},)")
 
 
@@ -139,21 +136,13 @@ def _reason(regressor: Regressor, what: str, error: Exception) -> str:
     """Which regressor failed and why; for a foreign error also where in the code."""
     text = " ".join(str(error).split())
     if not isinstance(error, BcrlError):
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        where = f"({place.filename}:{place.lineno})"
         kind = type(error).__name__
-        kind = "out of memory" if isinstance(error, MemoryError) else kind
-        text = f"{kind}: {text} {where}"
+        if isinstance(error, MemoryError):
+            kind = "out of memory"
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        text = f"{kind}: {text} ({place.filename}:{place.lineno})"
     name = textwrap.shorten(repr(regressor), 200)
     return f"algorithm.regressor={name}: {what} failed: {text}"
-
-
-class Threads(Protocol):
-    """An object with the number of threads that predictions may use."""
-
-    @property
-    def threads(self) -> int:
-        """The number of threads."""
 
 
 @storable
@@ -163,7 +152,7 @@ class FittedQ:
 
     models: Sequence[Sequence[Fitted | None]]
     regressor: Regressor
-    team: Threads
+    team: Any  # its `threads` may be used
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         self._restore()

@@ -1,7 +1,5 @@
 """Our own regressors, and all regressors of fitted Q-iteration by name."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -46,14 +44,14 @@ class Tabular:
     finite_only = True
 
     def fit(self, problems: Sequence[Problem], keep: bool, threads: int) -> list[Fit]:
-        return [self._fit_one(p) for p in problems]
-
-    def _fit_one(self, problem: Problem) -> Fit:
-        _, cell = np.unique(problem.x, axis=0, return_inverse=True)
-        cell = cell.reshape(-1)  # NumPy 2.0 gives (n, 1)
-        weight = np.bincount(cell, problem.multiplicity)
-        mean = np.bincount(cell, problem.multiplicity * problem.y) / weight
-        return Fit(None, mean[cell], np.zeros(len(problem.queries)))
+        fits = []
+        for p in problems:
+            _, cell = np.unique(p.x, axis=0, return_inverse=True)
+            cell = cell.reshape(-1)  # NumPy 2.0 gives (n, 1)
+            weight = np.bincount(cell, p.multiplicity)
+            mean = np.bincount(cell, p.multiplicity * p.y) / weight
+            fits.append(Fit(None, mean[cell], np.zeros(len(p.queries))))
+        return fits
 
     def predict(
         self, models: Sequence[Any], x: Sequence[NDArray], threads: int
@@ -72,13 +70,11 @@ REGRESSORS = {
 def regressor_class(name: str) -> type:
     """The regressor class for the config key `algorithm.regressor.name`.
 
-    A name with dots, `package.module.Class`, is a user's class; ConfigError otherwise
-    for a name that is unknown.
+    A name with dots is a user's class; ConfigError for another name that is unknown.
     """
+    key = "algorithm.regressor.name"
     if "." in name:
-        return plugins.component("algorithm.regressor.name", name, name)
+        return plugins.component(key, name, name)
     if name not in REGRESSORS:
-        raise ConfigError(
-            "algorithm.regressor.name", name, did_you_mean(name, REGRESSORS)
-        )
+        raise ConfigError(key, name, did_you_mean(name, REGRESSORS))
     return REGRESSORS[name]

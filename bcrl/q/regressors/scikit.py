@@ -1,7 +1,5 @@
 """scikit-learn's regressors in fitted Q-iteration."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 import inspect
@@ -68,23 +66,25 @@ class Sklearn(_Fitting):
     standardise: bool = False
 
     def __post_init__(self) -> None:
+        key = "algorithm.regressor.arguments"
         if not isinstance(self.arguments, (dict, type(None))):
-            why = "must be names and values, or null"
-            raise ConfigError("algorithm.regressor.arguments", self.arguments, why)
+            raise ConfigError(key, self.arguments, "must be names and values, or null")
         try:
             self._model(0)
         except (TypeError, ValueError) as error:
-            place = "algorithm.regressor.arguments"
             why = " ".join(str(error).split())
-            raise ConfigError(place, self.arguments, why) from error
+            raise ConfigError(key, self.arguments, why) from error
 
     def _model(self, seed: int) -> Any:
         from sklearn.base import clone
         from sklearn.pipeline import make_pipeline
         from sklearn.preprocessing import StandardScaler
 
-        named = isinstance(self.estimator, str)
-        made = _class(self.estimator)() if named else clone(self.estimator)
+        made, classes = self.estimator, _regressors()
+        if isinstance(made, str) and made not in classes:
+            place = "algorithm.regressor.estimator"
+            raise ConfigError(place, made, did_you_mean(made, classes))
+        made = classes[made]() if isinstance(made, str) else clone(made)
         known, arguments = made.get_params(), self.arguments or {}
         for key, value in arguments.items():
             if key not in known:
@@ -121,16 +121,6 @@ class SklearnForest(TreeKeys, _Fitting):
         leaf, split = self.min_samples_leaf, self.min_samples_split
         keys = {"min_samples_leaf": leaf, "min_samples_split": split}
         return ExtraTreesRegressor(self.trees, random_state=seed, **keys)
-
-
-def _class(name: str) -> type:
-    """scikit-learn's regressor called `name`; ConfigError if there is none."""
-    found = _regressors()
-    if name not in found:
-        raise ConfigError(
-            "algorithm.regressor.estimator", name, did_you_mean(name, found)
-        )
-    return found[name]
 
 
 @functools.cache
