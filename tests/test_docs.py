@@ -73,12 +73,10 @@ def test_links_and_named_files_exist(page):
 
 
 def test_pages_that_code_and_configs_name_exist():
-    paths = [
-        p for ending in ("bcrl/**/*.py", "conf/**/*.yaml") for p in ROOT.glob(ending)
-    ]
-    for path in (*paths, *ROOT.glob("examples/*.py")):
-        for name in re.findall(r"docs/[\w/]+\.md", path.read_text("utf-8")):
-            assert (ROOT / name).exists(), (path, name)
+    for pattern in ("bcrl/**/*.py", "conf/**/*.yaml", "examples/*.py"):
+        for path in ROOT.glob(pattern):
+            for name in re.findall(r"docs/[\w/]+\.md", path.read_text("utf-8")):
+                assert (ROOT / name).exists(), (path, name)
 
 
 SHORT = {

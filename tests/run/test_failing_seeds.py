@@ -67,12 +67,10 @@ class SickForest(Sick, ForestRegressor):
     way: str = "raises"
 
 
-def course(env, regressor, seeds, *transfers, iterations=4):
+def course(env, regressor, seeds, *transfers):
     """Snapshots of two stages, and what a probe measures."""
-    learner = FQI(iterations, 5, regressor)
-    stages = [
-        Stage(n, n, env, learner, transfers, (n - 1) * iterations) for n in (1, 2)
-    ]
+    learner = FQI(4, 5, regressor)
+    stages = [Stage(n, n, env, learner, transfers, 4 * n - 4) for n in (1, 2)]
     probe = Probe(seeds, [env], ["return", "solved", "residual_start"])
     for now in learn(stages, replace(team(*seeds), probe=probe.states)):
         yield now, probe.measure(now), dict(probe.failed)

@@ -113,8 +113,8 @@ def final_q(p, seed: int) -> np.ndarray:
 
 def test_seeds_differ_in_data_and_in_trees(tmp_path):
     """Each alone suffices: first the data are shared, then there are no trees."""
-    hill = (*KINDS["car_on_hill plain"], "algorithm.dataset=shared")
-    for p in (run(tmp_path, *hill), run(tmp_path, *TABULAR)):
+    same_data = (*KINDS["maze plain"], "algorithm.dataset=shared", "tag=x")
+    for p in (run(tmp_path, *same_data), run(tmp_path, *TABULAR, "tag=y")):
         assert not np.array_equal(final_q(p, 0), final_q(p, 1))
 
 
