@@ -39,14 +39,11 @@ def doubled(number: int) -> bool:
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-@pytest.mark.parametrize("suffix", ["nbi", "nbc"])  # numba's index, and the code
-def test_damaged_code_is_compiled_again_and_replaced(
-    tmp_path, monkeypatch, damage, suffix
-):
+def test_damaged_code_is_compiled_again_and_replaced(tmp_path, monkeypatch, damage):
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
     assert not doubled(4) and doubled(4)
-    (path,) = tmp_path.rglob(f"*double*.{suffix}")
-    DAMAGES[damage](path)
+    for path in list(tmp_path.rglob("*double*.nb?")):
+        DAMAGES[damage](path)
     assert not doubled(4)
     assert doubled(4) == (damage != "a folder")
 

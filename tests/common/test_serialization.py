@@ -92,8 +92,8 @@ def test_only_storable_classes_are_stored_and_by_their_own_name(there_and_back):
 
 
 FORGED = [
-    ["object", "os.system", {"command": "true"}],
-    ["object", "bcrl.q.functions.Sum", {"terms": ["list", []], "more": 1}],
+    ["object", ["os.system", {"command": "true"}]],
+    ["object", ["bcrl.q.functions.Sum", {"terms": ["list", []], "more": 1}]],
     ["array", [0, "|O", [1], "C"]],
     ["array", [0, "<f8", [1000], "C"]],
     ["array", [-8, "<f8", [1], "C"]],

@@ -111,7 +111,7 @@ def test_a_checkpoint_of_other_code_or_config_counts_as_absent(tmp_path, monkeyp
     with monkeypatch.context() as patch:
         patch.setattr(Path, "read_bytes", lambda p: read(p) + b"#" * ("fqi" in p.name))
         importlib.reload(checkpoints)  # a module of ours has changed
-        assert checkpoints.batches(p) == {}
+        assert not checkpoints.batches(p)
     importlib.reload(checkpoints)
     assert list(checkpoints.batches(p)) == [(0, 1)]
     stored = dict(np.load(path))
@@ -119,7 +119,7 @@ def test_a_checkpoint_of_other_code_or_config_counts_as_absent(tmp_path, monkeyp
     for key in ("code", "sources", "config", "device"):
         text = json.dumps(known | {key: "another"}).encode()
         np.savez(path, **stored | {"about": np.frombuffer(text, np.uint8)})
-        assert checkpoints.batches(p) == {} and path.exists(), key
+        assert not checkpoints.batches(p) and path.exists(), key
     runner.run(p)  # from the start
     assert about(p, 0)["interruptions"] == 0 and not path.exists()
 

@@ -93,7 +93,7 @@ def test_a_complete_seed_is_skipped_and_a_changed_one_computed_again(tmp_path, c
     second.write_bytes(before.replace(b"1", b"2", 1))
     runner.run(p)
     assert second.read_bytes() == before and first.stat().st_mtime_ns == when
-    assert "seed 1: the CSV is not" in capsys.readouterr().err
+    assert "the CSV is not" in capsys.readouterr().err
     assert pending(p) == []
 
 
@@ -197,14 +197,13 @@ def test_a_diverging_seed_is_recorded_and_reported(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_sweep_shows_progress_costs_and_the_command_of_what_failed(bcrl, tmp_path):
+def test_a_sweep_shows_progress_and_the_command_of_what_failed(bcrl, tmp_path):
     rates = ("algorithm.learning_rate=1e-4,1e30", "seeds.count=1", "progress=lines")
     words = ("-m", *KINDS["dqn BC"], *rates, "tag=null")
     done = bcrl(*words)
     assert done.returncode == 1, done.stderr
     assert "1 seed failed" in done.stderr and "Traceback" not in done.stderr
-    for part in ("· step 2540/2540 · seed 0", "core min", "peak memory"):
-        assert part in done.stderr
+    assert "· step 2540/2540 · seed 0" in done.stderr
     made = list(tmp_path.glob("runs/smoke/linear_system/*/seed_0000.json"))
     commands = [json.loads(path.read_text())["command"] for path in made]
     assert commands == [shlex.join(["bcrl", *words])] * 2  # can be pasted
