@@ -1,7 +1,5 @@
 """What several tests share."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -25,12 +23,8 @@ def arguments(
     *overrides: str, multirun: bool = False, config_dir: str | None = None
 ) -> Namespace:
     """What `bcrl *overrides` parses to."""
-    return Namespace(
-        overrides=list(overrides),
-        multirun=multirun,
-        config_dir=config_dir,
-        config_name=None,
-    )
+    words = {"overrides": list(overrides), "multirun": multirun}
+    return Namespace(**words, config_dir=config_dir, config_name=None)
 
 
 def plans(*overrides: str, **options) -> list[Plan]:
@@ -50,12 +44,14 @@ def bcrl(tmp_path: Path):
 
     def run(*arguments: str) -> subprocess.CompletedProcess:
         program = "import sys; sys.argv[0] = 'bcrl'; from bcrl.cli import main; main()"
+        own = {
+            "BCRL_CACHE": tmp_path.parent / "cache",
+            "XDG_CONFIG_HOME": tmp_path / "-",
+        }
         return subprocess.run(
             [sys.executable, "-c", program, *arguments],
             cwd=tmp_path,
-            env=os.environ
-            | {"BCRL_CACHE": str(tmp_path.parent / "cache")}
-            | {"XDG_CONFIG_HOME": str(tmp_path.parent / "no_config")},
+            env=os.environ | own,
             capture_output=True,
             text=True,
         )

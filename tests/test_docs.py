@@ -1,25 +1,30 @@
-"""The commands in the docs would run, and what the docs name exists."""
+"""The commands in the docs would run, what the docs name exists, and citations."""
 
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
+import bcrl
 from bcrl.config import flags, jobs
 from bcrl.run import status
 
 ROOT = Path(__file__).parents[1]
-#: tests/envs/test_other_packages.py runs this page's commands.
-OTHER_PACKAGES = "other_packages.md"
+DOCS = ROOT / "docs"
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "bench/README.md")),
-    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted(DOCS.rglob("*.md")),
 ]
+TEXT = {page: page.read_text("utf-8") for page in PAGES}
 #: Commands that compose many jobs, or try out simulators.
 SLOW = r"experiment=|env=gymnasium|env=mountain_car"
-#: Pages that are made when the site is built.
-GENERATED = (ROOT / "docs" / "reference" / "config.md",)
+CITATION = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+#: Made when the site is built.
+GENERATED = DOCS / "reference" / "config.md"
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 
 def commands(page: Path) -> list[str]:
@@ -27,24 +32,19 @@ def commands(page: Path) -> list[str]:
 
     tests/test_own.py runs those with a folder of configs.
     """
-    blocks = re.findall(r"```sh\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
+    blocks = re.findall(r"```sh\n(.*?)```", TEXT[page], re.S)
     lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
     found = [line for line in lines if re.match(r"bcrl (?!--config-dir)[^…<$]*$", line)]
     return [shlex.join(shlex.split(line, comments=True)) for line in found]
 
 
-COMMANDS = dict.fromkeys(
-    line for page in PAGES if page.name != OTHER_PACKAGES for line in commands(page)
-)
+#: tests/envs/test_other_packages.py runs the commands of its page.
+PLACES = [page for page in PAGES if page.name != "other_packages.md"]
+COMMANDS = dict.fromkeys(line for page in PLACES for line in commands(page))
+slow = {line: [pytest.mark.slow] * bool(re.search(SLOW, line)) for line in COMMANDS}
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        pytest.param(line, marks=pytest.mark.slow) if re.search(SLOW, line) else line
-        for line in COMMANDS
-    ],
-)
+@pytest.mark.parametrize("line", [pytest.param(x, marks=slow[x]) for x in COMMANDS])
 def test_every_command_would_run(line, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = shlex.split(line)[1:]
@@ -54,72 +54,75 @@ def test_every_command_would_run(line, tmp_path, monkeypatch):
 
 
 def anchors(page: Path) -> set[str]:
-    titles = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.M)
+    titles = re.findall(r"^#+ (.+)$", TEXT[page], re.M)
     return {re.sub(r"[^\w\- ]", "", t.lower()).replace(" ", "-") for t in titles}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_somewhere(page):
-    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
-    for target, _, name in (
-        link.partition("#") for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text)
-    ):
+@each_page
+def test_links_and_named_files_exist(page):
+    """Files such as `bcrl/learning/stage.py`, `tests/run/` or `examples/own_env.py`."""
+    text = re.sub(r"```.*?```", "", TEXT[page], flags=re.S)
+    for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text):
+        target, _, name = link.partition("#")
         other = (page.parent / target).resolve() if target else page
-        assert other.exists() or other in GENERATED, target
+        assert other.exists() or other == GENERATED, target
         assert not name or name in anchors(other), (target, name)
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_named_files_exist(page):
-    """Such as `bcrl/learning/stage.py`, `tests/run/` or `examples/own_env.py`."""
-    for name in re.findall(
-        r"`((?:bcrl|tests|conf|examples|bench|docs)/[\w./-]*(?:/|\.\w+))`",
-        page.read_text("utf-8"),
-    ):
+    folders = "bcrl|tests|conf|examples|bench|docs"
+    for name in re.findall(rf"`((?:{folders})/[\w./-]*(?:/|\.\w+))`", TEXT[page]):
         assert (ROOT / name).exists(), name
 
 
 def test_pages_that_code_and_configs_name_exist():
-    for folder, ending in (("bcrl", "py"), ("conf", "yaml"), ("examples", "py")):
-        for path in (ROOT / folder).rglob(f"*.{ending}"):
+    for pattern in ("bcrl/**/*.py", "conf/**/*.yaml", "examples/*.py"):
+        for path in ROOT.glob(pattern):
             for name in re.findall(r"docs/[\w/]+\.md", path.read_text("utf-8")):
                 assert (ROOT / name).exists(), (path, name)
 
 
 SHORT = {
-    **{"FQI": "fitted Q-iteration", "DQN": "deep Q-network", "LQ": "linear-quadratic"},
+    **{"FQI": "fitted q-iteration", "DQN": "deep q-network", "LQ": "linear-quadratic"},
     **{"LSPI": "least-squares policy iteration", "IQM": "interquartile mean"},
-    **{
-        "PPR": "policy reuse",
-        "RPL": "residual polic",
-        "ϱ": "residual",
-        "γ": "discount",
-    },
+    **{"PPR": "policy reuse", "RPL": "residual polic", "ϱ": "residual"},
+    "γ": "discount",
 }
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@each_page
 def test_short_forms_are_spelled_out_on_each_page(page):
-    text = page.read_text("utf-8")
-    words = " ".join(text.split()).lower()
-    prose = re.sub(r"```.*?```|`[^`]*`", "", text, flags=re.S)
+    words = " ".join(TEXT[page].split()).lower()
+    prose = re.sub(r"```.*?```|`[^`]*`", "", TEXT[page], flags=re.S)
     for short, meaning in SHORT.items():
         if re.search(rf"(?<!\w){short}(?!\w)", prose):
-            assert meaning.lower() in words, short
+            assert meaning in words, short
 
 
 def test_every_page_is_in_the_navigation():
     navigation = (ROOT / "mkdocs.yml").read_text("utf-8").partition("\nnav:")[2]
     listed = set(re.findall(r": ([\w/.-]+\.md)$", navigation, re.M))
-    pages = {path.relative_to(ROOT / "docs") for path in (ROOT / "docs").rglob("*.md")}
-    made = {path.relative_to(ROOT / "docs") for path in GENERATED}
-    assert listed == {page.as_posix() for page in pages | made}
+    pages = {*DOCS.rglob("*.md"), GENERATED}
+    assert listed == {page.relative_to(DOCS).as_posix() for page in pages}
 
 
 def test_the_glossary_explains_the_symbols_and_short_forms():
-    glossary = (ROOT / "docs" / "reference" / "glossary.md").read_text("utf-8")
     terms = "ϱ s0 T1 F ν LSPI PPR RPL LQ IQM @released slot lane base potential prior"
     terms += " lockstep seed stage task residual boosting curriculum shaping transfer"
-    first = re.findall(r"^\| (.*?) \|", glossary, re.M)
+    first = re.findall(r"^\| (.*?) \|", TEXT[DOCS / "reference" / "glossary.md"], re.M)
     for term in terms.split():
         assert any(re.search(rf"(?<!\w){re.escape(term)}\b", x) for x in first), term
+
+
+def test_the_paper_is_what_is_cited():
+    paper, readme = CITATION["preferred-citation"], TEXT[ROOT / "README.md"]
+    assert CITATION["cff-version"] == "1.2.0" and CITATION.keys() >= {
+        "message",
+        "title",
+    }
+    assert (paper["type"], paper["year"]) == ("conference-paper", 2022)
+    assert all(author["family-names"] in readme for author in paper["authors"])
+
+
+def test_there_is_one_version():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert bcrl.__version__ == project["version"] == str(CITATION["version"])
+    found = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    assert found == ["Unreleased", bcrl.__version__]

@@ -1,26 +1,24 @@
 """What docs/howto/own.md adds from outside the package, by its files and commands."""
 
+import json
 import os
 import re
 import shlex
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from bcrl import cli
 
 DOC = (Path(__file__).parents[1] / "docs" / "howto" / "own.md").read_text()
-#: Each block of a file, whole, by the path that one of its first lines names.
-FILES = [
-    (name, text)
-    for text, name in re.findall(
-        r"```(?:python|yaml)\n((?:# @[^\n]+\n)?# ((?:code|conf)/\S+)\n.*?)```",
-        DOC,
-        re.S,
-    )
-]
+#: Each block of a file, whole, and the path that one of its first lines names.
+FILES = re.findall(
+    r"```(?:python|yaml)\n((?:# @[^\n]+\n)?# ((?:code|conf)/\S+)\n.*?)```", DOC, re.S
+)
 COMMANDS = re.findall(r"```sh\nbcrl (--config-dir .*?)\n```", DOC, re.S)
+#: A part of each command, and what it makes.
 RESULTS = {
     "env=swing_up variant=plain": ("FQI", "C-FQI", "BC-FQI"),
     "algorithm/regressor": ("BC-FQI@*",),
@@ -31,21 +29,13 @@ RESULTS = {
 }
 
 
-def test_the_page_has_a_file_and_a_command_of_each_kind():
-    folders = {str(Path(name).parent) for name, _ in FILES}
-    kinds = {"env", "algorithm", "algorithm/regressor", "curriculum", "transfer"}
-    assert {f"conf/{kind}" for kind in kinds} <= folders
-    assert len(COMMANDS) == len(RESULTS)
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """The page's files, and their code on Python's path."""
     place = tmp_path_factory.mktemp("own")
-    for name, text in FILES:
-        path = place / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
+    for text, name in FILES:
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        (place / name).write_text(text)
     code = str(place / "code")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(code)
@@ -64,9 +54,15 @@ def test_it_runs_from_outside(folder, monkeypatch, command, names):
     small += ["seeds.lockstep=1", f"runs_dir=runs/{len(command)}"]
     monkeypatch.setattr(sys, "argv", ["bcrl", *shlex.split(command), *small])
     cli.main()
+    runs = folder / "runs" / str(len(command))
     for name in names:
-        made = folder.glob(f"runs/{len(command)}/smoke/swing_up/{name}/seed_0001.csv")
-        assert list(made), list(folder.rglob("seed_*.csv"))
+        (made,) = runs.glob(f"smoke/swing_up/{name}/seed_0001.csv")
+    for log in runs.glob(".lines/smoke/swing_up/BC-FQI/seed_0001.jsonl"):
+        lines = [json.loads(line) for line in log.read_text().splitlines()]
+        assert [line["return"] for line in lines] == pd.read_csv(made)[
+            "return"
+        ].tolist()
+    assert (runs / ".lines").exists() == ("logger" in command)
 
 
 def test_a_config_alone_may_not_name_the_code(folder, monkeypatch, tmp_path, capsys):

@@ -5,36 +5,25 @@ import os
 import shlex
 import subprocess
 import sys
-from pathlib import Path
 
-import matplotlib
 import numpy as np
 import pytest
 
 from bcrl.common import files, terminal
 from bcrl.common.divergence import diverging
-from bcrl.report.figures import style
 
 
-def no_home() -> Path:
-    raise RuntimeError("no home")
-
-
-def test_a_user_folder_is_absolute_or_at_home_if_there_is_one(tmp_path, monkeypatch):
+def test_a_user_folder_is_absolute_or_at_home(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
-    for value, name in (("", ".config"), ("relative", ".config"), ("~/mine", "mine")):
+    for value, name in (("~/mine", "mine"), ("relative", ".config"), ("", ".config")):
         monkeypatch.setenv("XDG_CONFIG_HOME", value)
         found = files.user_folder("XDG_CONFIG_HOME", ".config")
         assert found == tmp_path / name
-    monkeypatch.setenv("XDG_CONFIG_HOME", "")
-    monkeypatch.setattr(Path, "home", no_home)
-    assert files.user_folder("XDG_CONFIG_HOME", ".config") is None
 
 
-@pytest.mark.parametrize("value", ["", "0", "-1", "2(x3)", "abc", "1.5", " "])
+@pytest.mark.parametrize("value", ["", "0", "-1", "2(x3)", "1.5"])
 def test_a_variable_that_is_no_number_is_ignored(value, monkeypatch):
     monkeypatch.setenv("NUMBA_NUM_THREADS", value)
-    assert terminal.count("NUMBA_NUM_THREADS") is None
     terminal.ready()
     assert "NUMBA_NUM_THREADS" not in os.environ
 
@@ -65,26 +54,11 @@ def test_closed_streams_take_no_file(closed, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["report.cli", "report.verify"])
-def test_a_full_or_closed_output_is_no_traceback(command, tmp_path):
-    line = f"{sys.executable} -m bcrl.{command} --help"
-    for output in ("/dev/full", "/dev/null <&- 2>&-"):
-        done = subprocess.run(
-            f"{line} >{output}", shell=True, cwd=tmp_path, stderr=subprocess.PIPE
-        )
-        assert b"Traceback" not in done.stderr, done.stderr
-
-
-@pytest.mark.slow
-def test_a_report_needs_no_backend_and_no_settings_of_the_users():
-    odd = {"MPLBACKEND": "module://no_such_package.backend"}
-    program = "import bcrl.report, os; assert os.environ['MPLBACKEND'][:6] == 'module'"
-    done = subprocess.run([sys.executable, "-c", program], env=os.environ | odd)
-    assert done.returncode == 0
-    mine = {"text.usetex": True, "font.family": "serif", "axes.grid": True}
-    with matplotlib.rc_context(mine), style.sheet():
-        seen = {key: matplotlib.rcParams[key] for key in mine}
-    assert list(seen.values()) == [False, ["DejaVu Sans"], False]
+@pytest.mark.parametrize("output", [">/dev/full", ">/dev/null <&- 2>&-"])
+def test_a_full_or_closed_output_is_no_traceback(output, tmp_path):
+    line = f"{sys.executable} -m bcrl.results.verify --help {output}"
+    done = subprocess.run(line, shell=True, cwd=tmp_path, stderr=subprocess.PIPE)
+    assert b"Traceback" not in done.stderr and b"No module" not in done.stderr
 
 
 def test_large_values_diverge():

@@ -1,14 +1,11 @@
 """Made-up runs, written by the code that writes real ones."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import yaml
 from numpy.typing import NDArray
 
 from bcrl.common import files
@@ -18,12 +15,7 @@ from bcrl.run import records
 
 
 def made_up_plan(
-    runs_dir: Path,
-    env: str,
-    name: str,
-    seeds: range,
-    scale: str = "smoke",
-    config: Mapping[str, Any] | None = None,
+    runs_dir: Path, env: str, name: str, seeds: range, scale: str = "smoke", config=None
 ) -> Plan:
     """A plan without anything to learn, of the variant `name` (`FQI@tag`)."""
     variant, _, tag = name.partition("@")
@@ -83,10 +75,3 @@ def rerecord(path: Path, content: bytes | str) -> None:
 def edit_csv(path: Path, edit: Callable[[pd.DataFrame], pd.DataFrame]) -> None:
     """A seed's CSV as if the run had left an edited one."""
     rerecord(path, edit(pd.read_csv(path)).to_csv(index=False, na_rep="nan"))
-
-
-def edit_config(path: Path, section: str, **changes: Any) -> None:
-    """Change values of a section of a config.yaml."""
-    config = yaml.safe_load(path.read_text())
-    config[section] |= changes
-    path.write_text(yaml.safe_dump(config, sort_keys=False))

@@ -1,26 +1,16 @@
 """The checks of result files: each thing that may be wrong, by name and remedy."""
 
-from __future__ import annotations
-
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 
 from bcrl.errors import BcrlError
 from bcrl.report.load import load_runs
 from bcrl.results import verify
-from bcrl.results.integrity import check_tree
-from tests.results.made_up import (
-    edit_config,
-    edit_csv,
-    made_up_plan,
-    rerecord,
-    reseal,
-    write_seeds,
-)
+from tests.results.made_up import edit_csv, made_up_plan, rerecord, reseal, write_seeds
 
 HEADER = "stage,task,iteration,q_error,return\n"
 
@@ -31,15 +21,11 @@ def table(seed: int) -> pd.DataFrame:
     return pd.DataFrame(index | {"q_error": rng.random(4), "return": rng.random(4)})
 
 
-def arrays(seed: int) -> dict[str, np.ndarray]:
-    return {"q": np.random.default_rng(seed).random((2, 3))}
-
-
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A variant of four complete seeds, alone in the tree `tmp_path`."""
     plan = made_up_plan(tmp_path, "car_on_hill", "BC-FQI@mine", range(4))
-    write_seeds(plan, table, arrays, {"command": "bcrl env=car_on_hill"})
+    write_seeds(plan, table, facts={"command": "bcrl env=car_on_hill"})
     return plan.directory
 
 
@@ -56,12 +42,10 @@ def verified(tmp_path, capsys):
 
 def test_nothing_wrong(folder, tmp_path, verified):
     """Other files, other white space and keys that decide no number are no fault."""
-    for name in (".seed_0007.lock", ".config.lock", ".seed_0001.csv.77.tmp"):
-        (folder / name).write_text("")
-    (folder / "checkpoint_0007.npz").write_text("")
     (tmp_path / "figures").mkdir()
-    (tmp_path / "figures" / "figure_1_smoke.png").write_text("")
-    (tmp_path / "README.md").write_text("")
+    others = [".seed_0007.lock", ".config.lock", ".seed_0001.csv.77.tmp"]
+    for name in (*others, "checkpoint_0007.npz", "../../../figures/figure_1.png"):
+        (folder / name).write_text("")
     path = folder / "seed_0001.json"
     path.write_text(path.read_text().replace("\n", "\n\n"))
     path = folder / "config.yaml"
@@ -70,8 +54,9 @@ def test_nothing_wrong(folder, tmp_path, verified):
 
 
 def test_seeds_may_be_equal_and_environments_record_anything(tmp_path, verified):
-    plan = made_up_plan(tmp_path, "car_on_hill", "FQI", range(3))
-    write_seeds(plan, lambda seed: table(0), lambda seed: arrays(0))
+    write_seeds(
+        made_up_plan(tmp_path, "car_on_hill", "FQI", range(3)), lambda _: table(0)
+    )
     env = {"name": "mine", "metrics": ["angle"]}
     plan = made_up_plan(tmp_path, "mine", "FQI", range(2), config={"env": env})
     row = {"stage": 1, "task": 1, "iteration": 1, "angle": np.nan}
@@ -85,22 +70,18 @@ def test_seeds_may_be_equal_and_environments_record_anything(tmp_path, verified)
 BROKEN = [
     ("seed_0001.json", '{"status": "compl', "JSON"),
     ("seed_0001.json", "[" * 100_000, "JSON"),
-    ("seed_0001.json", "[1]", "object"),
     ("seed_0001.json", {"schema": 1}, "schema 1, this version reads 2"),
     ("seed_0001.json", {"seed": 4}, "seed 4, not 1"),
     ("seed_0001.json", {"scale": "paper"}, "scale 'paper', not 'smoke'"),
-    ("seed_0001.json", {"env": "maze"}, "env 'maze', not 'car_on_hill'"),
-    ("seed_0001.json", {"variant": "FQI"}, "variant 'FQI', not 'BC-FQI'"),
     ("seed_0001.json", {"tag": None}, "tag None, not 'mine'"),
+    ("seed_0001.json", lambda text: text.replace(": 5", ": 5.0"), "digest"),
     ("seed_0001.json", None, "missing"),
     ("seed_0001.csv", None, "missing"),
     ("seed_0001.csv", HEADER, "SHA-256"),
     ("seed_0001.npz", "PK", "SHA-256"),
     ("seed_0001 (copy).csv", HEADER, "name"),
-    ("seed_0009.json", '{"schema": 2', "JSON"),
     ("config.yaml", None, "missing"),
     ("config.yaml", "env: [", "config"),
-    ("config.yaml", "!!int ''", "config"),
     ("config.yaml", "env: {}", "algorithm.episodes: there"),
 ]
 
@@ -111,7 +92,7 @@ def spoil(path: Path, how) -> None:
     elif isinstance(how, dict):
         reseal(path, **how)
     else:
-        path.write_bytes(how if isinstance(how, bytes) else how.encode())
+        path.write_text(how if isinstance(how, str) else how(path.read_text()))
 
 
 @pytest.mark.parametrize(("name", "how", "what"), BROKEN)
@@ -122,16 +103,9 @@ def test_what_is_broken_is_named(folder, tmp_path, verified, name, how, what):
     assert lines[0].startswith(f"broken: {folder / name} ") and what in lines[0]
     assert any(f": {do} " in lines[0] for do in ("delete", "move it", "put it"))
     for allowed in (False, True):
-        with pytest.raises(BcrlError, match=f"{folder.name}/") as rejection:
+        with pytest.raises(BcrlError) as rejection:
             load_runs(tmp_path, "smoke", allow_incomplete=allowed)
         assert f"{folder / name} " in str(rejection.value)
-
-
-def test_every_value_of_a_json_is_sealed(folder, verified):
-    path = folder / "seed_0002.json"
-    path.write_text(path.read_text().replace('"episodes": 5', '"episodes": 5.0'))
-    code, lines = verified()
-    assert code == 2 and f"{path} " in lines[0] and "digest" in lines[0]
 
 
 # --- tables that were recorded as they are, and yet can't be right
@@ -140,44 +114,46 @@ TABLES = [
     (lambda t: t[:0], "has no rows"),
     (lambda t: t.drop(columns="return"), "has the header stage,task,"),
     (lambda t: t.assign(extra=1), "expected stage,task,iteration,q_error,return"),
-    (lambda t: t.assign(stage="one"), "CSV of numbers"),
+    (lambda t: t.assign(stage="one"), "number"),
     (lambda t: t[::-1], "iterations 1 to 4"),
     (lambda t: t.assign(stage=[1, 2, 1, 2]), "stages that fall"),
     (lambda t: t.assign(task=0), "task"),
     (lambda t: t.assign(q_error=[1, 2, np.nan, 4]), "q_error in row 3"),
     (lambda t: t.assign(**{"return": np.inf}), "return in row 1"),
     (lambda t: t[:3], "seed_0001.csv in its length (3 rows, not 4)"),
-    (lambda t: t.assign(task=1), "seed_0001.csv in its task column"),
     (lambda t: t.assign(stage=1, task=1), "in its stage and task columns"),
+    (None, "is not a readable CSV"),
 ]
 
 
 @pytest.mark.parametrize(("edit", "what"), TABLES)
 def test_tables_that_cannot_be_right_are_named(folder, verified, edit, what):
-    edit_csv(folder / "seed_0000.csv", edit)
+    path = folder / "seed_0000.csv"
+    edit_csv(path, edit) if edit else rerecord(path, b"")
     code, lines = verified()
     assert (code, len(lines)) == (2, 2)
-    assert lines[0].startswith(f"broken: {folder}/seed_0000.csv ") and what in lines[0]
+    assert lines[0].startswith(f"broken: {path} ") and what in lines[0]
     assert f": delete {folder}/seed_0000.* and " in lines[0]
 
 
-def test_a_csv_that_is_none_is_named(folder, verified):
-    rerecord(folder / "seed_0000.csv", b"")
-    assert "seed_0000.csv is not a readable CSV" in verified()[1][0]
+DIFFERENCES = [
+    ({"episodes": 6}, "(algorithm.episodes: there "),
+    ({"episodes": 5.0}, "(types of values)"),
+    (
+        {"a": 1, "b": 2, "c": 3, "d": 4},
+        "; algorithm.c: there ",
+    ),
+]
 
 
-def test_a_config_that_is_not_the_seeds_is_named_with_the_difference(folder, verified):
-    for changes, what in (
-        ({"episodes": 6}, "algorithm.episodes: there 5, here 6)"),
-        ({"episodes": 5.0}, "(types of values)"),
-        (
-            {"a": 1, "b": 2, "c": 3, "episodes": 5, "name": "other"},
-            "algorithm.c: there 'absent', here 3; and 1 more)",
-        ),
-    ):
-        edit_config(folder / "config.yaml", "algorithm", **changes)
-        _, lines = verified()
-        assert f"{folder}/config.yaml " in lines[0] and what in lines[0]
+@pytest.mark.parametrize(("changes", "what"), DIFFERENCES)
+def test_a_config_that_is_not_the_seeds_is_named(folder, verified, changes, what):
+    path = folder / "config.yaml"
+    config = yaml.safe_load(path.read_text())
+    config["algorithm"] |= changes
+    path.write_text(yaml.safe_dump(config, sort_keys=False))
+    _, lines = verified()
+    assert f"{path} " in lines[0] and what in lines[0]
 
 
 def test_a_seed_of_another_config_is_named(folder, tmp_path, verified):
@@ -192,27 +168,15 @@ def test_a_seed_of_another_config_is_named(folder, tmp_path, verified):
     assert verified()[0] == 0
 
 
-@pytest.mark.parametrize("to", ["BC-FQI", "C-FQI@mine", "../maze/BC-FQI@mine"])
-def test_a_folder_copied_to_another_name_is_named(folder, verified, to):
-    shutil.copytree(folder, folder.parent / to)
-    code, lines = verified()
-    assert (code, len(lines)) == (2, 5)
-    assert all(line.count(" belongs to ") == 1 for line in lines[:4])
-    assert f"{(folder.parent / to).resolve()}/seed_0000.json belongs to" in lines[0]
-
-
 # --- what is incomplete
 
 INCOMPLETE = [
-    (
-        "seed_0001.json",
-        {"status": "running", "sha256": {}},
-        ' "running"',
-    ),
+    ("seed_0001.json", {"status": "running", "sha256": {}}, ' "running"'),
     ("seed_0001.json", {"status": "failed: why"}, ' "failed: why"'),
     ("seed_0001.*", None, " lacks seed 1,"),
     ("seed_000[13].*", None, " lacks seeds 1, 3,"),
     ("seed_*", None, " has no seeds"),
+    ("seed_0003.json", {"asked": [[0, 19]]}, " lacks seeds 4–19"),  # by a later command
 ]
 
 
@@ -228,25 +192,6 @@ def test_what_is_incomplete_is_named(folder, tmp_path, verified, pattern, how, w
         load_runs(tmp_path, "smoke")
 
 
-def test_seeds_that_were_to_be_made_later_are_missing(folder, tmp_path, verified):
-    made = made_up_plan(tmp_path, "car_on_hill", "BC-FQI@mine", range(20)).config
-    more = {"asked": [[0, 19]], "command": "bcrl seeds.count=20"}
-    reseal(folder / "seed_0003.json", config=made, **more)
-    code, lines = verified()
-    assert code == 1 and "lacks seeds 4–19" in lines[0]
-    assert "(`bcrl seeds.count=20`)" in lines[0]
-    (variant,), _ = check_tree(tmp_path)
-    assert len(variant.tables) == 4 and len(variant.requested) == 20
-
-
-def test_a_failed_seed_that_left_files_must_have_left_these(folder, verified):
-    reseal(folder / "seed_0001.json", status="failed: why")
-    (folder / "seed_0001.csv").write_text(HEADER)
-    code, lines = verified()
-    assert code == 2 and "seed_0001.csv " in lines[0]
-    assert lines[-1] == "1 variant, 3 seeds complete; 1 broken, 1 incomplete"
-
-
 # --- the tree
 
 
@@ -257,19 +202,14 @@ def test_no_folder_no_runs(tmp_path, capsys, name):
     assert f"bcrl-verify: {tmp_path / name} " in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("depth", range(4))
-def test_a_folder_that_cannot_be_read_is_named(folder, verified, monkeypatch, depth):
-    shut, listing = [folder, *folder.parents][depth], Path.iterdir
-
+def test_a_folder_that_cannot_be_read_is_named(folder, verified, monkeypatch):
     def iterdir(path: Path):
-        if path == shut:
-            raise PermissionError(13, "Permission denied")
-        return listing(path)
+        raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "iterdir", iterdir)
     code, lines = verified()
     assert code == 2
-    assert lines[0].startswith(f"broken: {shut} can't be read (Permission denied)")
+    assert lines[0].endswith("can't be read (Permission denied): make it readable")
 
 
 def test_names_that_no_terminal_prints_are_escaped(folder, verified):

@@ -1,10 +1,8 @@
 """Kills runs at random moments and lets them resume; a program, because it forks.
 
 This process imports and composes, children do the rest: threads don't survive a fork.
-`python -m tests.run.killing FOLDER SEED KILLS NAME…` prints one JSON object per name.
+`python -m tests.run.killing FOLDER SEED KILLS NAME` prints a JSON object.
 """
-
-from __future__ import annotations
 
 import json
 import os
@@ -13,42 +11,21 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
-from bcrl.common import files
 from bcrl.config.plan import Plan
-from bcrl.run import records, runner
+from bcrl.run import runner
 from tests.conftest import plan
-from tests.run.runs import DQN, FQI, METHODS, RELEASED, compared, dqn
+from tests.run.runs import KINDS, compared
 
-SMALL = tuple(word for word in DQN if word != "env=linear_system")
-RUNS = {
-    f"{env} {name}": (f"env={env}", f"variant={name}", *FQI)
-    for env in ("maze", "car_on_hill")
-    for name in ("plain", "C", "B", "BC", "SC")
-}
-RUNS |= {f"dqn {name}": dqn(name) for name in METHODS + RELEASED}
-HILL = ("env=car_on_hill", *FQI, "tag=x")
-FOREST = ("algorithm/regressor=sklearn_forest", "algorithm.regressor.trees=3")
-CART = ("env.horizon=90", "scale.max_steps=150", "algorithm.learning_starts=60")
-DATA = ("algorithm.dataset=shared", "algorithm.new_data=task")
-RUNS |= {
-    "dqn in the maze": ("env=maze", *SMALL, "variant=SBC", "scale.max_steps=100"),
-    "fqi on the system": ("env=linear_system", "variant=BC", *FQI),
-    "sklearn's forest": (*HILL, "variant=BC", *FOREST),
-    "sklearn by name": (*HILL, "variant=C", "algorithm/regressor=sklearn"),
-    "fqi in gymnasium": ("env=acrobot", "variant=BC", *FQI, "env.horizon=15"),
-    "dqn in gymnasium": ("env=cart_pole", *SMALL, "variant=SBC", *CART),
-    "the same data": (*HILL, "variant=B", *DATA),
-}
+RACE = (*KINDS["maze BC"], "seeds.count=6", "seeds.lockstep=1", "tag=x")
+RACE += ("algorithm.regressor.trees=30", "threads=1")
 LIMIT = 120.0  # seconds for one run, however often it is killed
 
 
-def planned(name: str, folder: Path, *more: str) -> Plan:
-    return plan(*RUNS[name], "threads=1", f"runs_dir={folder}", *more)
-
-
-def forked(work: Callable[[], None]) -> int:
+def forked(work: Callable[[], object]) -> int:
     """The process that does `work` and then leaves; 9 if it raised."""
     child = os.fork()
     if child:
@@ -64,121 +41,88 @@ def forked(work: Callable[[], None]) -> int:
         os._exit(9)
 
 
-class Counter:
-    """Counts written bytes, and kills its process in the middle of byte `fatal`."""
+def undisturbed(folder: Path, words: tuple[str, ...]) -> tuple[Plan, float]:
+    """A whole run and its seconds, after one that compiles."""
+    for place in ("compiling", "calm"):
+        p, began = plan(*words, f"runs_dir={folder / place}"), time.monotonic()
+        assert os.waitpid(forked(partial(runner.run, p)), 0)[1] == 0
+    return p, time.monotonic() - began
 
-    def __init__(self, fatal: int | None) -> None:
-        self.fatal, self.written = fatal, 0
 
-    def open(self, *arguments):
-        self.file = open(*arguments)  # noqa: SIM115
-        return self
+def run_until_write(p: Plan, fatal: int) -> None:
+    """A run that is killed in its n-th write, when half of the file is there."""
+    fsync, calls = os.fsync, []
 
-    def write(self, data) -> int:
-        data = bytes(data)
-        self.written += len(data)
-        if self.fatal is not None and self.written > self.fatal:
-            self.file.write(data[: len(data) - (self.written - self.fatal)])
-            self.file.flush()
+    def deadly(file: int) -> None:
+        calls.append(file)
+        if len(calls) == fatal:
+            with suppress(OSError):  # a folder has no half
+                os.ftruncate(file, os.fstat(file).st_size // 2)
             os.kill(os.getpid(), signal.SIGKILL)
-        return self.file.write(data)
+        fsync(file)
 
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.file.close()
-
-    def __getattr__(self, name: str):
-        return getattr(self.file, name)
-
-
-def counted(p: Plan, count: Counter) -> None:
-    """Run a plan whose written bytes are counted."""
-    files.open = count.open
+    os.fsync = deadly
     runner.run(p)
 
 
-def whole(p: Plan) -> tuple[float, int]:
-    """Seconds and written bytes of an undisturbed run."""
-    reader, writer = os.pipe()
-
-    def work() -> None:
-        counted(p, count := Counter(None))
-        os.write(writer, str(count.written).encode())
-
-    began = time.monotonic()
-    assert os.waitpid(forked(work), 0)[1] == 0, p.name
-    return time.monotonic() - began, int(os.read(reader, 99))
-
-
-def torment(name: str, folder: Path, rng: random.Random, kills: int) -> dict:
+def torment(words: tuple[str, ...], folder: Path, rng: random.Random, kills: int):
     """A run killed `kills` times; whether it ends as if it were not."""
-    whole(planned(name, folder / "compiling"))
-    calm = planned(name, folder / "calm")
-    seconds, size = whole(calm)
+    calm, seconds = undisturbed(folder, words)
+    writes = 2 * len(list(calm.directory.iterdir()))
     done = rounds = inside = 0
     began = time.monotonic()
     while done < kills and time.monotonic() < began + LIMIT:
         rounds += 1
-        p = planned(name, folder / f"{rounds}", "checkpoint_every=0.01")
+        p = plan(*words, f"runs_dir={folder / str(rounds)}", "checkpoint_every=0.01")
         while True:
-            within = rng.random() < 0.3  # in the middle of a write
-            count = Counter(rng.randrange(size) if within else None)
-            child = forked(lambda p=p, count=count: counted(p, count))
-            if not within:
+            if within := rng.random() < 0.3:  # in the middle of a write
+                child = forked(partial(run_until_write, p, rng.randint(1, writes)))
+            else:
+                child = forked(partial(runner.run, p))
                 time.sleep(rng.uniform(0.1, 1.2) * seconds)
                 os.kill(child, signal.SIGKILL)
             status = os.waitpid(child, 0)[1]
             if not os.WIFSIGNALED(status):
                 break
             done, inside = done + 1, inside + within
-        problem = compared(calm, p)
-        if status or problem:
-            return {"kills": done, "problem": problem or f"status {status}"}
+        if problem := compared(calm, p) or status:
+            return {"kills": done, "problem": problem}
     return {"kills": done, "inside": inside, "runs": rounds, "problem": None}
 
 
 def race(folder: Path, rng: random.Random, processes: int) -> dict:
     """Several processes at the same seeds, one of them killed; who computed what."""
-    more = ("seeds.count=6", "seeds.lockstep=1", "algorithm.regressor.trees=30")
-    whole(planned("maze BC", folder / "compiling", *more, "tag=x"))
-    calm = planned("maze BC", folder / "calm", *more, "tag=x")
-    seconds, _ = whole(calm)
-    p = planned("maze BC", folder / "raced", *more, "tag=x", "checkpoint_every=0.05")
+    calm, seconds = undisturbed(folder, RACE)
+    p = plan(*RACE, f"runs_dir={folder / 'raced'}", "checkpoint_every=0.05")
     computed = folder / "computed"
     computed.mkdir()
 
     def work() -> None:
-        write = records.write_seed
+        replace = os.replace
 
-        def noted(plan: Plan, seed: int, *rest) -> None:
-            (computed / f"{seed}_{os.getpid()}").touch()
-            write(plan, seed, *rest)
+        def noted(source, target) -> None:
+            if Path(target).match("seed_*.npz"):
+                (computed / f"{Path(target).stem}_{os.getpid()}").touch()
+            replace(source, target)
 
-        records.write_seed = noted
+        os.replace = noted
         runner.run(p)
 
     children = [forked(work) for _ in range(processes)]
     time.sleep(rng.uniform(0.2, 0.6) * seconds)
     os.kill(children[0], signal.SIGKILL)
     left = [os.waitpid(child, 0)[1] for child in children][1:]
-    made = sorted(int(file.name.split("_")[0]) for file in computed.iterdir())
+    made = sorted(int(file.name.split("_")[1]) for file in computed.iterdir())
     problem = compared(calm, p) or (f"statuses {left}" if any(left) else None)
     return {"problem": problem, "computed": made}
 
 
-def main(folder: str, seed: str, kills: str, *names: str) -> None:
-    for name in names or RUNS:
-        rng = random.Random(f"{seed} {name}")
-        place = Path(folder, name.replace(" ", "_").replace("'", ""))
-        place.mkdir()
-        if name.startswith("race of"):
-            found = race(place, rng, int(name.split()[-1]))
-        else:
-            found = torment(name, place, rng, int(kills))
-        print(json.dumps({"name": name, **found}), flush=True)
-
-
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    place, seed, kills, name = sys.argv[1:]
+    rng = random.Random(f"{seed} {name}")
+    if name.startswith("race of"):
+        found = race(Path(place), rng, int(name.split()[-1]))
+    else:
+        words = (*KINDS[name], "threads=1")
+        found = torment(words, Path(place), rng, int(kills))
+    print(json.dumps(found))

@@ -1,30 +1,51 @@
 """Small choices of whole runs, how to run them, and how to compare their folders."""
 
-from __future__ import annotations
-
-import csv
 import json
+from collections.abc import Callable
 from pathlib import Path
+
+import pandas as pd
+import pytest
 
 from bcrl.common import files
 from bcrl.config.plan import Plan
+from bcrl.results import loggers
 from bcrl.results.layout import seed_path
 from bcrl.run import runner
 from tests.conftest import plan
 
 FQI = ("scale=smoke", "progress=none", "seeds.count=2")
 MAZE = ("env=maze", "variant=BC", *FQI)
+TABULAR = ("env=maze", *FQI, "algorithm/regressor=tabular")
 LINEAR = ("env=linear_system", "algorithm=dqn", "scale=smoke", "progress=none")
 #: DQN in a second: 40 updates after the random steps, with several target copies.
 DQN = (*LINEAR, "seeds.count=2", "scale.max_steps=540", "algorithm.target_update=7")
 DQN += ("algorithm.evaluation_episodes=3", "tag=x")
 METHODS = ("plain", "C", "BC", "SC", "SBC", "RPL", "PPR")
-RELEASED = ("BC_released", "SC_released", "SBC_released")
-
-
-def dqn(variant: str) -> tuple[str, ...]:
-    """The overrides of a small DQN run; RPL's offset is shorter than the run."""
-    return (*DQN, f"variant={variant}", *["transfer.offset=510"] * (variant == "RPL"))
+METHODS += ("BC_released", "SC_released", "SBC_released")
+HILL = ("env=car_on_hill", *FQI, "tag=x")
+SMALL = tuple(word for word in DQN if word != "env=linear_system")
+CART = ("env.horizon=90", "scale.max_steps=150", "algorithm.learning_starts=60")
+#: Every variant of the paper, and others; RPL's offset is shorter than the run.
+KINDS = {
+    f"{env} {name}": (f"env={env}", f"variant={name}", *FQI)
+    for env in ("car_on_hill", "maze")
+    for name in ("plain", "C", "B", "BC")
+}
+KINDS |= {f"dqn {name}": (*DQN, f"variant={name}") for name in METHODS}
+KINDS["dqn RPL"] += ("transfer.offset=510",)
+KINDS |= {
+    "dqn in the maze": ("env=maze", *SMALL, "variant=SBC", "scale.max_steps=100"),
+    "dqn on the hill": ("env=car_on_hill", *SMALL, "variant=PPR"),
+    "dqn in gymnasium": ("env=cart_pole", *SMALL, "variant=SBC", *CART),
+    "fqi on the system": ("env=linear_system", "variant=BC", *FQI),
+    "fqi in gymnasium": ("env=acrobot", "variant=BC", *FQI, "env.horizon=15"),
+    "sklearn's forest": (*HILL, "variant=BC", "algorithm/regressor=sklearn_forest"),
+    "sklearn by name": (*HILL, "variant=C", "algorithm/regressor=sklearn"),
+    "the same data": (*HILL, "variant=B", "algorithm.dataset=shared"),
+}
+KINDS["the same data"] += ("algorithm.new_data=task",)
+KINDS["sklearn's forest"] += ("algorithm.regressor.trees=3",)
 
 
 def run(folder: Path, *overrides: str) -> Plan:
@@ -32,6 +53,18 @@ def run(folder: Path, *overrides: str) -> Plan:
     made = plan(*overrides, f"runs_dir={folder}")
     runner.run(made)
     return made
+
+
+def at_row(patch: pytest.MonkeyPatch, number: int, act: Callable[[], object]) -> None:
+    """Let `act` happen when a run has measured so many rows, of whatever seed."""
+    rows = []
+
+    def write(*row) -> None:
+        rows.append(row)
+        if len(rows) == number:
+            act()
+
+    patch.setattr(loggers.Nothing, "write", write)
 
 
 def results(made: Plan, seed: int) -> tuple[bytes, bytes]:
@@ -47,8 +80,7 @@ def about(made: Plan, seed: int) -> dict:
 
 def rows(made: Plan, seed: int) -> list[dict[str, float]]:
     """A seed's CSV; an empty cell is NaN."""
-    lines = csv.DictReader(seed_path(made.directory, seed, "csv").open())
-    return [{key: float(cell or "nan") for key, cell in x.items()} for x in lines]
+    return pd.read_csv(seed_path(made.directory, seed, "csv")).to_dict("records")
 
 
 def compared(calm: Plan, other: Plan) -> str | None:
