@@ -53,9 +53,7 @@ def bcrl(tmp_path: Path):
         return subprocess.run(
             [sys.executable, "-c", program, *arguments],
             cwd=tmp_path,
-            env=os.environ
-            | {"BCRL_CACHE": str(tmp_path.parent / "cache")}
-            | {"XDG_CONFIG_HOME": str(tmp_path.parent / "no_config")},
+            env=os.environ | {"XDG_CONFIG_HOME": str(tmp_path.parent / "no_config")},
             capture_output=True,
             text=True,
         )

@@ -67,7 +67,7 @@ def outside(installed, tmp_path):
 
     def run(*command: str, **variables: str) -> subprocess.CompletedProcess:
         clean = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-        clean |= {"XDG_CONFIG_HOME": str(tmp_path.parent), "BCRL_CACHE": str(tmp_path)}
+        clean |= {"XDG_CONFIG_HOME": str(tmp_path.parent)}
         program = str(installed / command[0])
         return subprocess.run(
             [program, *command[1:]],
