@@ -14,7 +14,6 @@ from bcrl.evaluation.step_metrics import evaluate
 from bcrl.learning.dqn import DQN, DRAW_BLOCK, DQNTrainer
 from bcrl.learning.lspi import LSPI
 from bcrl.learning.replay import Replay
-from bcrl.learning.stage import snapshots
 from bcrl.learning.transfer import (
     Boost,
     PolicyReuse,
@@ -27,7 +26,7 @@ from bcrl.learning.transfer import (
 )
 from bcrl.q.functions import Table
 from bcrl.q.networks.mlp import Networks
-from tests.toys import Corridor, last, staged, team
+from tests.toys import Corridor, last, snapshots, staged, team
 
 TARGET, LQ = LinearSystem(), LinearSystem("lq", horizon=100)
 BRIEF = LinearSystem(horizon=30)  # quick to evaluate
@@ -203,7 +202,7 @@ def trained(name, seeds, priors, settings=SHORT, look=True):
     start, rows = begin(TRANSFERS[name], previous), []
     for snapshot in learn(settings, start, BRIEF, seeds, number=2):
         if look:
-            rows.append(evaluate(snapshot, seeds))
+            rows.append(evaluate(snapshot, seeds)[0])
     return snapshot, rows
 
 
@@ -273,7 +272,7 @@ def test_it_learns_to_walk_the_corridor(transfers):
         prior = Table([values, values], env)
         start = begin(transfers, StageResult(prior, prior))
     first, *_, final = (
-        (snapshot, evaluate(snapshot, (0, 1)))
+        (snapshot, evaluate(snapshot, (0, 1))[0])
         for snapshot in learn(settings, start, env, (0, 1))
     )
     assert all(row["greedy_success_rate"] == 1.0 for row in final[1])

@@ -69,7 +69,7 @@ def test_the_papers_readings_learn_it_too(kind):
 
 
 def test_learning_pays_and_counts_its_steps():
-    seen = [(x, evaluate(x, (0, 1))) for x in iterations((0, 1), before=70)]
+    seen = [(x, evaluate(x, (0, 1))[0]) for x in iterations((0, 1), before=70)]
     assert [x.count for x, _ in seen] == [70, 570, 1070, 1570, 2070]
     assert [x.last_of_stage for x, _ in seen] == [False] * 4 + [True]
     for s in range(2):

@@ -4,16 +4,14 @@ import numpy as np
 
 from bcrl.common.seeding import stream
 from bcrl.envs.maze import Maze
-from bcrl.learning.rollout import draws, rollout, start_states
+from bcrl.learning.rollout import draws, rollout, starts_and_draws
 from bcrl.q.functions import ZERO, Table
 from tests.toys import Corridor, OpenCorridor
 
 
 def play(env, q, epsilon, seeds=(0, 1), episodes=7):
     rngs = [stream(seed, "data") for seed in seeds]
-    start = np.stack([start_states(rng, env, episodes) for rng in rngs])
-    u = np.stack([draws(rng, env, episodes) for rng in rngs])
-    return rollout(env, q, start, u, epsilon)
+    return rollout(env, q, *starts_and_draws(rngs, env, episodes), epsilon)
 
 
 def tables(env, seeds=2):
@@ -61,7 +59,7 @@ def test_exploration_happens_at_rate_epsilon():
 def test_discounted_return_by_hand():
     env = Corridor(prize=2.0, gamma=0.5)
     right = Table([np.tile([0.0, 1.0], (6, 1))], env)
-    u = draws(stream(0, "evaluation"), env, 1)[None]
+    u = draws([stream(0, "evaluation")], env, 1)
     played = rollout(env, right, np.full((1, 1, 1), 3.0), u)
     assert played.length.tolist() == [[2]]
     assert played.discounted_return(0.5).tolist() == [[-0.1 + 0.5 * 2.0]]

@@ -42,8 +42,8 @@ BASE = np.array([0.5, 0.25, -2.0])
 
 
 def target(base, next_base, boost):
-    fixed, discount, inside = precompute_target(
-        REWARD, ABSORBING, next_base, base, 0.9, boost.maxima, boost.mask_at_goal
+    inside, fixed, discount = precompute_target(
+        REWARD, ABSORBING, next_base, base, 0.9, boost
     )
     return fixed + discount * (NEXT_RESIDUAL + inside).max(-1)
 
@@ -213,7 +213,8 @@ def test_the_prior_acts_with_probability_nu_to_the_step(step, nu, epsilon):
     residual, prior = (
         np.broadcast_to(-np.abs(np.arange(8.0) - best), (1, n, 8)) for best in (2, 5)
     )
-    own, done = run._choose(residual, np.zeros((1, n, 8)), prior, u, epsilon)
+    frozen = (np.zeros((1, n, 8)), None, prior)
+    own, done = run._choose(residual, frozen, u, epsilon)
     random, follow = u[0, :, 0] < epsilon, u[0, :, 2] < nu**step
     free = np.where(random, np.floor(8 * u[0, :, 1]), 2)
     assert np.array_equal(done[0], np.where(follow, 5, free))

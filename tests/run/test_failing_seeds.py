@@ -12,7 +12,7 @@ from bcrl.evaluation.metrics import Probe
 from bcrl.evaluation.step_metrics import StepProbe
 from bcrl.learning.dqn import DQN
 from bcrl.learning.fqi import FQI
-from bcrl.learning.rollout import draws, rollout, start_states
+from bcrl.learning.rollout import rollout, starts_and_draws
 from bcrl.learning.stage import CurriculumRun, Snapshot, Stage, learn
 from bcrl.learning.transfer import Boost, warm_start
 from bcrl.q.forest.estimator import ExtraTrees
@@ -118,8 +118,7 @@ def test_a_table_that_is_not_finite_is_walked_safely_and_named():
     good = np.random.default_rng(0).random((6, 2))
     tables = [good, np.full((6, 2), np.nan), np.where(good > 0.5, np.inf, good)]
     rngs = [stream(seed, "data") for seed in range(3)]
-    start = np.stack([start_states(rng, env, 4) for rng in rngs])
-    u = np.stack([draws(rng, env, 4) for rng in rngs])
+    start, u = starts_and_draws(rngs, env, 4)
     played = rollout(env, Table(tables, env), start, u)
     assert set(played.failed) == {1, 2}
     alone = rollout(env, Table([good], env), start[:1], u[:1])
@@ -213,15 +212,14 @@ def test_files_and_exit_code_of_a_seed_that_failed(tmp_path, monkeypatch):
 
 def numbers(seed, purpose, *path, episodes):
     """What resets the episodes of a seed and a purpose."""
-    found = start_states(stream(seed, purpose, *path), Simulated(), episodes)
-    return tuple(found[:, 0].tolist())
+    rngs = [stream(seed, purpose, *path)]
+    return tuple(starts_and_draws(rngs, Simulated(), episodes)[0].ravel().tolist())
 
 
 def test_episodes_name_the_seeds_whose_simulators_failed():
     env = replace(Simulated(), doomed=numbers(1, "data", 1, episodes=3)[1:2])
     rngs = [stream(seed, "data", 1) for seed in (0, 1, 2)]
-    start = np.stack([start_states(rng, env, 3) for rng in rngs])
-    u = np.stack([draws(rng, env, 3) for rng in rngs])
+    start, u = starts_and_draws(rngs, env, 3)
     q = Table([np.zeros((6, 2))] * 3, env)
     some, other = (rollout(e, q, start, u) for e in (env, Simulated()))
     assert some.failed == {1: "step failed: it broke"} and not other.failed

@@ -31,7 +31,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise BcrlError(f"{env} has no table: it has infinitely many states")
         show("\n".join(oracle.table(env)))
         if is_finite(env):
-            say(f"V*(s0) = {oracle.start_value(env):.12f}")
+            states, q = oracle.reference(env)
+            start = (states == env.evaluation_states()).all(-1)
+            say(f"V*(s0) = {q[start].max():.12f}")
     except BcrlError as error:
         say(f"python -m bcrl.oracle: {error}")
         return 2

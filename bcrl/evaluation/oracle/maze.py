@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from bcrl.envs import FiniteEnv
 from bcrl.envs.maze import Maze
 from bcrl.learning import Booleans, Floats, Integers
 from bcrl.learning.rollout import transition_tables
@@ -31,17 +30,6 @@ def optimal_q(
         q = new
 
 
-def lattice_q(env: FiniteEnv) -> Floats:
-    """Q* (N, A) on all states of a finite environment."""
-    return optimal_q(*transition_tables(env), env.gamma)
-
-
-def start_value(env: FiniteEnv) -> float:
-    """V*(s0) of the start state."""
-    start = env.initial(np.zeros(env.initial_noise))
-    return float(lattice_q(env)[env.index(start)].max())
-
-
 def reference(env: Maze) -> tuple[Floats, Floats]:
     """The states (n, 2) where an agent has to act, neither wall nor goal, and Q* there.
 
@@ -52,7 +40,7 @@ def reference(env: Maze) -> tuple[Floats, Floats]:
         env = replace(env, preset="lattice")
     states = env.states()
     inside = ~(env.blocked(states) | env.is_goal(states))
-    return states[inside], lattice_q(env)[inside]
+    return states[inside], optimal_q(*transition_tables(env), env.gamma)[inside]
 
 
 def table(env: Maze) -> Iterator[str]:
