@@ -100,17 +100,13 @@ class RunState:
     state: Any = None
 
 
+@dataclass
 class CurriculumRun:
-    """Learns stages in order; transfers start each one from the result before it.
+    """Learns stages in order; transfers start each one from the result before it."""
 
-    `state` is what a new `CurriculumRun` needs to resume from the latest pause.
-    """
-
-    def __init__(
-        self, stages: Sequence[Stage], batch: SeedBatch, state: RunState | None = None
-    ) -> None:
-        self.stages, self.batch = stages, batch
-        self.state = state or RunState(0, None)
+    stages: Sequence[Stage]
+    batch: SeedBatch
+    state: RunState = RunState(0, None)  # with the latest pause's a new run resumes
 
     def __iter__(self) -> Iterator[Pause]:
         for stage in self.stages[self.state.stages :]:
@@ -139,5 +135,5 @@ class CurriculumRun:
 
 def learn(stages: Sequence[Stage], batch: SeedBatch) -> Iterator[Snapshot]:
     """The snapshots of a whole run."""
-    pauses = iter(CurriculumRun(stages, batch))
-    return (pause for pause in pauses if isinstance(pause, Snapshot))
+    run = CurriculumRun(stages, batch)
+    return (pause for pause in run if isinstance(pause, Snapshot))
