@@ -37,8 +37,9 @@ def precompute_target(
     weight = discount if two else np.zeros_like(discount)
     if not boost.mask_at_goal:
         weight = np.where(absorbing, gamma, weight)
-    fixed = reward + weight * next_base.max(-1) - base
-    return np.zeros_like(next_base) if two else next_base, fixed, discount
+    if two or not boost.mask_at_goal:
+        reward = reward + weight * next_base.max(-1)
+    return np.zeros_like(next_base) if two else next_base, reward - base, discount
 
 
 def shaping(

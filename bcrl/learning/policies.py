@@ -42,9 +42,9 @@ def epsilon_greedy(
     q: Floats, explore: Floats, u: Floats, epsilon: Floats | float
 ) -> Integers:
     """`uniform` where `explore` (...) is below ε (a number, or one per last index)."""
-    rows, drawn = writable(q).reshape(-1, q.shape[-1]), writable(u).reshape(-1)
-    chances = writable(explore).reshape(-1), np.array(epsilon, np.float64, ndmin=1)
-    return _choices(rows, chances[0], drawn, chances[1]).reshape(u.shape)
+    rows = writable(q).reshape(-1, q.shape[-1])
+    drawn = (np.array(x, np.float64, order="C").ravel() for x in (explore, u, epsilon))
+    return _choices(rows, *drawn).reshape(u.shape)
 
 
 def greedy(q: Floats, u: Floats) -> Integers:

@@ -39,7 +39,8 @@ def check_width(states: Sequence[NDArray], d: int) -> None:
 
     Compiled code would read memory beside a shorter state.
     """
-    for width in {x.shape[-1] for x in states}:
+    stacked = isinstance(states, np.ndarray)
+    for width in {x.shape[-1] for x in (states[:1] if stacked else states)}:
         if width != d:
             raise BcrlError(
                 f"a Q-function of states with {d} entries can't be evaluated at states "
