@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.evaluation.step_metrics import evaluate
 from bcrl.learning.dqn import DQN
-from bcrl.learning.stage import SeedBatch, Stage, StepSnapshot, snapshots
+from bcrl.learning.stage import SeedBatch, Snapshot, Stage, StepSnapshot
 from bcrl.learning.transfer import StageInit
 
 ENV, STEPS, FILL = LinearSystem(), 1000, 600
@@ -78,7 +78,8 @@ def lockstep(n_seeds: int) -> Iterator[StepSnapshot]:
     learner = DQN(steps=10**9, evaluate_every=STEPS)
     stage = Stage(1, 1, ENV, learner, (), 0)
     team = SeedBatch(tuple(range(n_seeds)), np.zeros((1, 4)))
-    return snapshots(learner.learn(stage, StageInit(), team))
+    pauses = learner.learn(stage, StageInit(), team)
+    return (pause for pause in pauses if isinstance(pause, Snapshot))
 
 
 def main() -> None:

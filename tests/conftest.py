@@ -44,10 +44,7 @@ def bcrl(tmp_path: Path):
 
     def run(*arguments: str) -> subprocess.CompletedProcess:
         program = "import sys; sys.argv[0] = 'bcrl'; from bcrl.cli import main; main()"
-        own = {
-            "BCRL_CACHE": tmp_path.parent / "cache",
-            "XDG_CONFIG_HOME": tmp_path / "-",
-        }
+        own = {"XDG_CONFIG_HOME": tmp_path / "-"}
         return subprocess.run(
             [sys.executable, "-c", program, *arguments],
             cwd=tmp_path,

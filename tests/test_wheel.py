@@ -67,7 +67,7 @@ def outside(installed, tmp_path):
 
     def run(program: str, *words: str, code: int = 0, **variables) -> tuple[str, str]:
         clean = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-        clean |= {"XDG_CONFIG_HOME": str(tmp_path.parent), "BCRL_CACHE": str(tmp_path)}
+        clean |= {"XDG_CONFIG_HOME": str(tmp_path.parent)}
         done = subprocess.run(
             [installed / program, *words],
             cwd=tmp_path,

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from bcrl.common.serialization import storable
-from bcrl.learning.stage import SeedBatch, Stage
+from bcrl.learning.stage import SeedBatch, Snapshot, Stage
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,11 @@ def staged(learner, env, number=1, before=0):
 def team(*seeds):
     """Seeds that train together, with nothing to look at."""
     return SeedBatch(seeds, np.zeros((1, 1)))
+
+
+def snapshots(pauses):
+    """The pauses that are snapshots."""
+    return (pause for pause in pauses if isinstance(pause, Snapshot))
 
 
 def last(moments):

@@ -1,11 +1,9 @@
-"""Metrics: what is measured after each FQI iteration, in the task being trained."""
+"""Probes measure snapshots of some seeds; here also what FQI's iterations are asked."""
 
-from __future__ import annotations
-
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,21 +12,12 @@ from bcrl.common.seeding import stream
 from bcrl.envs import Env, is_simulated
 from bcrl.errors import BcrlError, ConfigError, did_you_mean
 from bcrl.evaluation import oracle
-from bcrl.evaluation.probe import SeedProbe
-from bcrl.learning import Booleans, Floats, Integers
+from bcrl.learning import Booleans, Floats, Integers, rollout
 from bcrl.learning.fqi import Iteration
-from bcrl.learning.rollout import (
-    Episodes,
-    draws,
-    evaluation_starts,
-    rollout,
-    starts_and_draws,
-    success_of,
-)
+from bcrl.learning.stage import Snapshot
 
 
-@dataclass(frozen=True)
-class View:
+class View(NamedTuple):
     """One seed's snapshot, as the metrics see it."""
 
     q: Floats  # (n_probe, A) at the probed states
@@ -63,8 +52,51 @@ def check_metrics(metrics: Sequence[str], target: Env) -> None:
         raise ConfigError("env.metrics", "q_error_start", why)
 
 
+class SeedProbe(ABC):
+    """Measures the snapshots of several seeds, and keeps what each stage ends with."""
+
+    index: ClassVar[str]  # the CSV's name for a snapshot's count
+    shown: tuple[rollout.Episodes, int]  # final episodes of all seeds; which to store
+
+    def __init__(self, seeds: Sequence[int], tasks: Sequence[Any]) -> None:
+        self.seeds, self.tasks = seeds, tasks
+        self.target = tasks[-1]
+        self.kept: list[Any] = []  # by stage, recorded at its end; checkpoints store it
+        #: Seeds, by index, that can't continue after the latest measurement, and why.
+        self.failed: dict[int, str] = {}
+
+    @abstractmethod
+    def measure(self, snapshot: Any) -> list[dict[str, float]]:
+        """Each seed's metrics, by column of the CSV."""
+
+    @abstractmethod
+    def final(self, s: int) -> dict[str, NDArray]:
+        """`states` (n, d), and what the seed with index s has learned there."""
+
+    @abstractmethod
+    def facts(self) -> dict[str, Any]:
+        """What the metadata says about the measurements."""
+
+    def place(self, snapshot: Snapshot) -> dict[str, int]:
+        """The first columns of a snapshot's rows: stage, task and count."""
+        stage, task = snapshot.stage.number, snapshot.stage.task
+        return {"stage": stage, "task": task, self.index: snapshot.count}
+
+    def arrays(self, s: int) -> dict[str, NDArray]:
+        """The NPZ of the seed with index s: what it learned, an episode, the scene."""
+        (episodes, e), target = self.shown, self.target
+        length, found = episodes.length[s, e], self.final(s)
+        found["trajectory"] = episodes.state[s, e, : length + 1]  # (T + 1, d)
+        found["trajectory_actions"] = episodes.action[s, e, :length]  # (T,) or (T, k)
+        found["trajectory_start"] = episodes.start[s, e]  # what reset a simulator
+        if hasattr(target, "walls"):
+            walls = np.stack([task.walls for task in self.tasks])
+            return found | {"walls": walls, "goal": target.goal}
+        return found | (target.scene() if hasattr(target, "scene") else {})
+
+
 class Probe(SeedProbe):
-    """Measures FQI's iterations; draws from the evaluation streams only."""
+    """Measures FQI's iterations in their tasks; draws from the evaluation streams."""
 
     index = "iteration"
 
@@ -72,63 +104,54 @@ class Probe(SeedProbe):
         self, seeds: Sequence[int], tasks: Sequence[Env], metrics: Sequence[str]
     ) -> None:
         super().__init__(seeds, tasks)
-        self.metrics = metrics
-
-    @cached_property
-    def states(self) -> Floats:
-        return probed_states(self.target)
+        self.metrics, self.states = metrics, probed_states(self.target)
 
     @cached_property
     def optimum(self) -> float | None:
         """V*(s0) of the target, if the oracle knows the only evaluation state."""
-        known, start = oracle.reference(self.target), self.target.evaluation_states()
-        if known is None or len(start) != 1:
-            return None
-        row = np.flatnonzero((known.states == start).all(-1))
-        return float(known.q[row[0]].max()) if len(row) else None
+        start, reference, q_star = _layout(self.target, self.target)
+        q = q_star[reference == start[0]]
+        return float(q.max()) if len(start) == 1 and len(q) else None
 
     def measure(self, snapshot: Iteration) -> list[dict[str, float]]:
-        """Each seed's metrics."""
+        """Each seed's metrics; only a simulator's episodes have random starts."""
         env = snapshot.stage.env
         rngs = [stream(seed, "evaluation", snapshot.count) for seed in self.seeds]
-        start = np.stack([evaluation_starts(rng, env) for rng in rngs])
-        u = np.stack([draws(rng, env, start.shape[1]) for rng in rngs])
-        episodes = rollout(env, snapshot.result.q, start, u)
+        if is_simulated(env):
+            start, u = rollout.starts_and_draws(rngs, env, env.starts)
+        else:
+            start = np.stack([env.evaluation_states()] * len(rngs))
+            u = rollout.draws(rngs, env, start.shape[1])
+        episodes = rollout.rollout(env, snapshot.result.q, start, u)
         self.failed = episodes.failed | snapshot.failed
-        returns = episodes.discounted_return(env.gamma)
-        solved = episodes.solved(success_of(env))
-        start_rows, known, q_star = _layout(env, self.target)
         if snapshot.last_of_stage:
             self.kept.append(snapshot.probed_residual)
             self._last = snapshot
+        returns = episodes.discounted_return(env.gamma)
+        solved = episodes.solved(rollout.success_of(env))
         optimum = np.nan if self.optimum is None else self.optimum
+        known = (*_layout(env, self.target), optimum)
+        learned = (snapshot.probed_q, snapshot.probed_residual, returns, solved)
         rows = []
-        for s, (q, residual) in enumerate(
-            zip(snapshot.probed_q, snapshot.probed_residual, strict=True)
-        ):
-            outcomes = (returns[s], solved[s])
-            view = View(q, residual, *outcomes, start_rows, known, q_star, optimum)
+        for s, outcome in enumerate(zip(*learned, strict=True)):
+            view = View(*outcome, *known)
             row = {name: float(METRICS[name](view)) for name in self.metrics}
-            void = s in self.failed
-            rows.append(dict.fromkeys(row, np.nan) if void else row)
+            rows.append(dict.fromkeys(row, np.nan) if s in self.failed else row)
         return rows
 
     def final(self, s: int) -> dict[str, NDArray]:
         residuals = np.stack([residual[s] for residual in self.kept])
-        last = self._last.probed_q[s]
-        return {"states": self.states, "q": last, "residuals": residuals}
+        q = self._last.probed_q[s]
+        return {"states": self.states, "q": q, "residuals": residuals}
 
     @cached_property
-    def _shown(self) -> Episodes:
-        rngs = [stream(seed, "evaluation", self._last.count) for seed in self.seeds]
-        start, u = starts_and_draws(rngs, self.target, 1)
-        episodes = rollout(self.target, self._last.result.q, start, u)
-        self.failed = episodes.failed | self.failed
-        return episodes
-
-    def shown(self) -> tuple[Episodes, int]:
+    def shown(self) -> tuple[rollout.Episodes, int]:
         """A greedy episode in the target task, the evaluation's if it has only one."""
-        return self._shown, 0
+        rngs = [stream(seed, "evaluation", self._last.count) for seed in self.seeds]
+        start, u = rollout.starts_and_draws(rngs, self.target, 1)
+        episodes = rollout.rollout(self.target, self._last.result.q, start, u)
+        self.failed = episodes.failed | self.failed
+        return episodes, 0
 
     def facts(self) -> dict[str, Any]:
         return {"optimum": self.optimum}

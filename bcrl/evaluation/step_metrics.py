@@ -1,34 +1,25 @@
 """Metrics of learners that count environment steps, from complete episodes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.common.seeding import stream
-from bcrl.evaluation.metrics import probed_states
-from bcrl.evaluation.probe import SeedProbe
-from bcrl.learning import Floats
+from bcrl.evaluation.metrics import SeedProbe, probed_states
 from bcrl.learning.rollout import CHOICES, Episodes, play, starts_and_draws, success_of
 from bcrl.learning.stage import StepSnapshot
 
 
-def evaluate(now: StepSnapshot, seeds: Sequence[int]) -> list[dict[str, float]]:
-    """Each seed's columns (docs/reference/metrics.md), in the stage's unshaped task."""
-    return _evaluate(now, seeds)[0]
-
-
-def _evaluate(
+def evaluate(
     now: StepSnapshot, seeds: Sequence[int]
 ) -> tuple[list[dict[str, float]], Episodes]:
-    """Each seed's columns, and their episodes: exploring ones, then greedy ones.
+    """Each seed's columns (docs/reference/metrics.md), in the stage's unshaped task.
 
-    Both policies get the same starts and the same noise, which depend on seed, stage
-    and step alone: evaluation does not change training.
+    Also their episodes: exploring ones, then greedy ones, from the same starts and with
+    the same noise. These depend on seed, stage and step alone: evaluation does not
+    change training.
     """
     env, n = now.stage.env, now.episodes
     path = (now.stage.number, now.count - now.stage.before)
@@ -41,16 +32,15 @@ def _evaluate(
         "success_rate": played.solved(success_of(env)),
     }
     first = np.ascontiguousarray(played.state[:, :n, 0])  # observed, unlike `start`
-    q: Any = now.result.q
-    best = np.asarray(q(first, env.n_actions)).max(-1)
-    rows = [
-        {name: float(values[s, :n].mean()) for name, values in outcomes.items()}
-        | {"q_mean": float(best[s].mean()), "loss": float(now.loss[s])}
-        | {f"greedy_{k}": float(values[s, n:].mean()) for k, values in outcomes.items()}
-        for s in range(len(seeds))
-    ]
-    for s in played.failed:  # void, except for the loss
-        rows[s] |= dict.fromkeys(rows[s].keys() - {"loss"}, np.nan)
+    best = np.asarray(now.result.q(first, env.n_actions)).max(-1)
+    rows = []
+    for s in range(len(seeds)):
+        row = {name: values[s, :n].mean() for name, values in outcomes.items()}
+        row |= {"q_mean": best[s].mean(), "loss": now.loss[s]}
+        row |= {f"greedy_{name}": x[s, n:].mean() for name, x in outcomes.items()}
+        if s in played.failed:  # void, except for the loss
+            row = dict.fromkeys(row, np.nan) | {"loss": now.loss[s]}
+        rows.append({name: float(value) for name, value in row.items()})
     return rows, played
 
 
@@ -59,29 +49,25 @@ class StepProbe(SeedProbe):
 
     index = "step"
 
-    @cached_property
-    def states(self) -> Floats:
-        target = self.target
-        return target.plane() if hasattr(target, "plane") else probed_states(target)
+    def __init__(self, seeds: Sequence[int], tasks: Sequence[Any]) -> None:
+        super().__init__(seeds, tasks)
+        plane = getattr(self.target, "plane", None)
+        self.states = plane() if plane else probed_states(self.target)
 
     def measure(self, snapshot: StepSnapshot) -> list[dict[str, float]]:
         """Each seed's row of the CSV."""
-        rows, played = _evaluate(snapshot, self.seeds)
+        rows, played = evaluate(snapshot, self.seeds)
         self.failed = played.failed | snapshot.failed
         if snapshot.last_of_stage:
-            self._shown = played, snapshot.episodes  # the first greedy one
+            self.shown = played, snapshot.episodes  # the first greedy one
             states = np.broadcast_to(self.states, (len(rows), *self.states.shape))
-            q: Any = snapshot.result.q
-            values = np.asarray(q(states, snapshot.stage.env.n_actions), np.float32)
-            self.kept.append((snapshot.stage.learner.name, values))
+            q = snapshot.result.q(states, snapshot.stage.env.n_actions)
+            self.kept.append((snapshot.stage.learner.name, np.asarray(q, np.float32)))
         return rows
 
     def final(self, s: int) -> dict[str, NDArray]:
         stages = np.stack([q[s] for _, q in self.kept])
         return {"states": self.states, "q": stages[-1], "q_stages": stages}
-
-    def shown(self) -> tuple[Episodes, int]:
-        return self._shown
 
     def facts(self) -> dict[str, Any]:
         return {"learners": [name for name, _ in self.kept]}

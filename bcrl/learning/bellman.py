@@ -1,10 +1,9 @@
 """Regression targets of plain and boosted value iteration, and reward shaping."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bcrl.learning import Booleans, Floats
+from bcrl.learning.transfer import Boost
 
 
 def residual_target(
@@ -25,22 +24,22 @@ def precompute_target(
     next_base: Floats,
     base: Floats,
     gamma: float,
-    maxima: str = "one",
-    mask_at_goal: bool = True,
+    boost: Boost,
 ) -> tuple[Floats, Floats, Floats]:
-    """The parts of a target that ϱ does not change: c (n,), discount (n,), b (n, A).
+    """The parts of a target that ϱ does not change: b (n, A), c (n,), discount (n,).
 
     The target is c + discount · max_a' (ϱ + b)(s', a'). With `one` maximum and the mask
     it is `residual_target`. With `two` it bootstraps with max ϱ(s') + max base(s').
     Without the mask, max base(s') counts in an absorbing next state, too [released].
     Shapes as in `residual_target`.
     """
-    discount = np.where(absorbing, 0.0, gamma)
-    weight = discount if maxima == "two" else np.zeros_like(discount)
-    if not mask_at_goal:
+    discount, two = np.where(absorbing, 0.0, gamma), boost.maxima == "two"
+    weight = discount if two else np.zeros_like(discount)
+    if not boost.mask_at_goal:
         weight = np.where(absorbing, gamma, weight)
-    fixed = reward + weight * next_base.max(-1) - base
-    return fixed, discount, np.zeros_like(next_base) if maxima == "two" else next_base
+    if two or not boost.mask_at_goal:
+        reward = reward + weight * next_base.max(-1)
+    return np.zeros_like(next_base) if two else next_base, reward - base, discount
 
 
 def shaping(

@@ -1,7 +1,5 @@
 """Curricula: the order in which the stages of a run visit an environment's tasks."""
 
-from __future__ import annotations
-
 
 def hand_made(n_tasks: int) -> list[int]:
     """Every task once, the easiest first, the target last (`curriculum=on`)."""

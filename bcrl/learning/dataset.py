@@ -1,7 +1,5 @@
 """Datasets of transitions over distinct points, as fitted Q-iteration needs them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,10 +52,8 @@ def build(env: Env, episodes: Episodes, seed: int, probe: NDArray) -> Dataset:
     before = episodes.state[seed, :, :-1][seen]  # (n, d)
     action = episodes.action[seed][seen]
     if is_finite(env):
-        points = env.states().astype(np.float32)
-        probed = env.index(probe)
-        pair = env.index(before) * env.n_actions + action
-        counts = np.bincount(pair)
+        points, probed = env.states().astype(np.float32), env.index(probe)
+        counts = np.bincount(env.index(before) * env.n_actions + action)
         pairs = np.flatnonzero(counts)
         count = counts[pairs]
         state, action = np.divmod(pairs, env.n_actions)
@@ -67,29 +63,19 @@ def build(env: Env, episodes: Episodes, seed: int, probe: NDArray) -> Dataset:
     else:
         after = episodes.state[seed, :, 1:][seen]
         every = np.concatenate([before, after, probe]).astype(np.float32)
-        first, label = _distinct(every.T)
-        points = every[first]
+        points, label = np.unique(every, axis=0, return_inverse=True)
+        label = label.reshape(-1)
         state, next_state, probed = np.split(label, [len(before), 2 * len(before)])
         reward = episodes.reward[seed][seen]
         absorbing = episodes.absorbing[seed][seen]
         count = np.ones(len(state), np.int64)  # a continuum seldom repeats
     by_action = []
     for a in range(env.n_actions):
-        rows, uncovered = np.flatnonzero(action == a), np.ones(len(points), bool)
-        uncovered[state[rows]] = False
-        rest = np.flatnonzero(uncovered)
+        rows = np.flatnonzero(action == a)
+        rest = np.setdiff1d(np.arange(len(points)), state[rows])
         x = points[state[rows]]
         by_action.append(ActionRows(rows, x, count[rows], points[rest], rest))
     parts = tuple(by_action)
     return Dataset(
         points, probed, state, action, reward, next_state, absorbing, count, parts
     )
-
-
-def _distinct(columns: NDArray) -> tuple[Integers, Integers]:
-    """First occurrence of each distinct row of `columns`, and each row's label."""
-    label = np.zeros(len(columns[0]), np.intp)
-    for column in columns:
-        values, rank = np.unique(column, return_inverse=True)
-        label = np.unique(label * len(values) + rank, return_inverse=True)[1]
-    return np.unique(label, return_index=True)[1], label

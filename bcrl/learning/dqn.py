@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -14,12 +14,11 @@ from bcrl.common.seeding import stream
 from bcrl.common.serialization import storable
 from bcrl.envs import lanes_of
 from bcrl.envs.base import Lanes
-from bcrl.learning import Booleans, Floats, Integers
+from bcrl.learning import Floats, Integers
 from bcrl.learning.bellman import precompute_target, shaping
-from bcrl.learning.dqn_update import updater
-from bcrl.learning.policies import annealed, combined_actions, greedy, uniform
-from bcrl.learning.replay import Replay
-from bcrl.learning.rollout import CHOICES, Policy
+from bcrl.learning.policies import combined_actions, epsilon_greedy, greedy
+from bcrl.learning.replay import Replay, batched, one_by_one
+from bcrl.learning.rollout import CHOICES
 from bcrl.learning.stage import Pause, SeedBatch, Stage, StepSnapshot
 from bcrl.learning.transfer import PolicyReuse, ResidualPolicy, StageInit, StageResult
 from bcrl.q.networks.mlp import Adam, DeepQ, Networks, xavier
@@ -61,16 +60,10 @@ class DQN:
 
     def epsilon_at(self, step: int) -> float:
         """ε in a step of the stage, counted from 0."""
-        trained = step - self.random_steps
-        if trained < 0:
-            return 1.0
-        return annealed(trained, self.epsilon_start, self.epsilon, self.anneal_steps)
-
-    def is_evaluated(self, step: int) -> bool:
-        """Whether a snapshot follows `step` steps of a stage."""
-        trained = step - self.random_steps
-        due = trained >= 0 and trained % self.evaluate_every == 0
-        return due or step == self.length
+        trained, over = step - self.random_steps, self.anneal_steps
+        if trained < 0 or trained >= over:
+            return 1.0 if trained < 0 else self.epsilon
+        return self.epsilon_start + (self.epsilon - self.epsilon_start) * trained / over
 
     def learn(
         self, stage: Stage, start: StageInit, batch: SeedBatch, state: Any = None
@@ -108,32 +101,23 @@ class DQNState:
     residual: NDArray | None = None  # (S, A) ϱ at `env_state`, if computed
 
 
-class FrozenValues(NamedTuple):
-    """Values (S, A) of Q-functions that the stage does not change, at `env_state`."""
-
-    base: Floats
-    potential: Floats
-    prior: Floats
-
-
+@dataclass(eq=False)
 class DQNTrainer:
     """S seeds in the middle of a stage, each with its environment and networks."""
 
-    def __init__(
-        self,
-        settings: DQN,
-        stage: Stage,
-        start: StageInit,
-        batch: SeedBatch,
-        state: DQNState | None = None,
-    ) -> None:
-        self.settings, self.stage = settings, stage
-        self.start, self.batch = start, batch
-        self.env, self.n_actions = stage.env, stage.env.n_actions
-        self.state = state or self._initial_state()
-        self._gradient_step = updater(self.state.deep, self.state.replay)
-        self._frozen = self._frozen_at(self.state.env_state)
-        if isinstance(start.behavior, ResidualPolicy):
+    settings: DQN
+    stage: Stage
+    start: StageInit
+    batch: SeedBatch
+    state: Any = None  # the `DQNState` of a pause, or a new one
+
+    def __post_init__(self) -> None:
+        self.env, self.n_actions = self.stage.env, self.stage.env.n_actions
+        self.state = now = self.state or self._initial_state()
+        updater = one_by_one if now.replay.rows.is_cpu else batched
+        self._gradient_step = updater(now.deep, now.replay)
+        self._frozen = self._frozen_at(now.env_state)
+        if isinstance(self.start.behavior, ResidualPolicy):
             self._combined = combined_actions(self.env.actions)
         self._block = -1  # the block whose uniforms are drawn
 
@@ -160,98 +144,80 @@ class DQNTrainer:
     def act(self) -> None:
         """Every seed makes one environment step and stores the transition."""
         env, start, now = self.env, self.start, self.state
-        u = self._draws()  # (S, CHOICES + step_noise + initial_noise)
+        u = self._draws()
         noise = u[:, CHOICES : CHOICES + env.step_noise]
-        residual = now.residual  # (S, A)
+        residual = now.residual
         if residual is None:
-            residual = self._values(now.deep, now.env_state[:, None])[:, 0]
-        frozen, epsilon = self._frozen, self.settings.epsilon_at(now.step)
-        own, action = self._choose(residual, frozen.base, frozen.prior, u, epsilon)
+            residual = self._values(now.deep, now.env_state)
+        epsilon = self.settings.epsilon_at(now.step)
+        own, action = self._choose(residual, self._frozen, u, epsilon)
         if isinstance(start.behavior, ResidualPolicy):
             now.n_greedy_decisions += u[:, 0] >= epsilon
         result = now.lanes.step(now.env_state, action, noise)
         next_state, reward, absorbing, cut = result
-        next_frozen = self._frozen_at(next_state)
+        base, potential, _ = self._frozen
+        frozen = next_base, next_potential, _ = self._frozen_at(next_state)
         if start.shape is not None:
-            next_potential = next_frozen.potential
             before = getattr(env, "before_reset", None)
             if before and start.shape.next_state == "before_reset":
                 left = before(now.env_state, action, noise)
-                next_potential = self._values(start.potential, left[:, None])[:, 0]
-            value, next_value = frozen.potential.max(-1), next_potential.max(-1)
-            zero_at_goal = start.shape.zero_at_goal
-            reward = reward + shaping(
-                value, next_value, absorbing, env.gamma, zero_at_goal
-            )
-        fixed, discount, next_base = precompute_target(
-            reward,
-            absorbing,
-            next_frozen.base,
-            frozen.base[np.arange(len(own)), own],
-            env.gamma,
-            start.boost.maxima,
-            start.boost.mask_at_goal,
+                next_potential = self._values(start.potential, left)
+            v, next_v = potential.max(-1), next_potential.max(-1)
+            zero = start.shape.zero_at_goal
+            reward = reward + shaping(v, next_v, absorbing, env.gamma, zero)
+        base_sa, gamma = base[np.arange(len(own)), own], env.gamma
+        target = precompute_target(
+            reward, absorbing, next_base, base_sa, gamma, start.boost
         )
-        now.replay.add(now.env_state, next_state, next_base, fixed, discount, own)
+        now.replay.add(now.env_state, next_state, *target, own)
         now.steps_in_episode += 1
         over = absorbing | cut | (now.steps_in_episode == env.horizon)
         if over.any():
-            fresh_noise = u[:, CHOICES + env.step_noise :]
-            next_state = now.lanes.restart(over, env.initial(fresh_noise), next_state)
+            fresh = env.initial(u[:, CHOICES + env.step_noise :])
+            next_state = now.lanes.restart(over, fresh, next_state)
             now.steps_in_episode[over] = 0
-            next_frozen = self._frozen_at(next_state)
-        now.env_state, self._frozen = next_state, next_frozen
+            frozen = self._frozen_at(next_state)
+        now.env_state, self._frozen = next_state, frozen
 
     def _draws(self) -> Floats:
         """All uniforms of this step, (S, CHOICES + step_noise + initial_noise)."""
         block, at = divmod(self.state.step, DRAW_BLOCK)
         if block != self._block:
-            env, number = self.env, self.stage.number
-            shape = (DRAW_BLOCK, CHOICES + env.step_noise + env.initial_noise)
-            batches = (DRAW_BLOCK, self.settings.batch_size)
-
-            def drawn(purpose: str, shape: tuple[int, int]) -> Floats:
-                rngs = (stream(s, purpose, number, block) for s in self.batch.seeds)
-                return np.stack([rng.random(shape) for rng in rngs], 1)
-
-            self._uniforms = drawn("exploration", shape)
-            self._indices = self.state.replay.indices(drawn("replay", batches), at)
+            width = CHOICES + self.env.step_noise + self.env.initial_noise
+            self._uniforms = self._drawn("exploration", block, width)
+            picks = self._drawn("replay", block, self.settings.batch_size)
+            self._indices = self.state.replay.indices(picks, at)
             self._block = block
         return self._uniforms[at]
 
-    def _values(self, q: Any, states: Floats) -> Floats:
-        """Values (S, n, A) of a Q-function at stacked states (S, n, d)."""
-        return q(states, self.n_actions)
+    def _drawn(self, purpose: str, block: int, width: int) -> Floats:
+        """A block's uniforms (DRAW_BLOCK, S, width)."""
+        rngs = (stream(s, purpose, self.stage.number, block) for s in self.batch.seeds)
+        return np.stack([rng.random((DRAW_BLOCK, width)) for rng in rngs], 1)
 
-    def _frozen_at(self, states: Floats) -> FrozenValues:
-        """Values of base, potential and prior at states (S, d), each Q queried once."""
-        start = self.start
-        base = self._values(start.base, states[:, None])[:, 0]
+    def _values(self, q: Any, state: Floats) -> Floats:
+        """Values (S, A) of a Q-function at one state (S, d) of each seed."""
+        return q(state[:, None], self.n_actions)[:, 0]
+
+    def _frozen_at(self, state: Floats) -> tuple[Floats, Floats, Floats]:
+        """Values (S, A) of base, potential and prior; each Q is queried once."""
+        base = self._values(self.start.base, state)
         potential, prior = (
-            base if q is start.base else self._values(q, states[:, None])[:, 0]
-            for q in (start.potential, start.prior)
+            base if q is self.start.base else self._values(q, state)
+            for q in (self.start.potential, self.start.prior)
         )
-        return FrozenValues(base, potential, prior)
+        return base, potential, prior
 
     def _choose(
-        self,
-        residual: NDArray,
-        base: Floats,
-        prior: Floats,
-        u: Floats,
-        epsilon: Floats | float,
-        reuse: Booleans | bool = True,
+        self, residual: Any, frozen: Any, u: Floats, epsilon: Any, reuse: Any = True
     ) -> tuple[Integers, Integers]:
         """The own action and the executed one (S, …), from values (S, …, A).
 
-        `reuse`: the lanes in which PPR may follow the prior.
+        `frozen`: see `_frozen_at`; `reuse`: lanes in which PPR may follow the prior.
         """
-        behavior, now = self.start.behavior, self.state
+        behavior, now, (base, _, prior) = self.start.behavior, self.state, frozen
         greedy_on = residual + base if self.start.boost.greedy_on == "sum" else residual
-        random, choice = u[..., 0] < epsilon, u[..., 1]
-        own = np.where(
-            random, uniform(self.n_actions, choice), greedy(greedy_on, choice)
-        )
+        own = epsilon_greedy(greedy_on, u[..., 0], u[..., 1], epsilon)
         if isinstance(behavior, PolicyReuse):
             follow = reuse & (u[..., 2] < behavior.nu**now.step)
             own = np.where(follow, greedy(prior, u[..., 1]), own)
@@ -260,7 +226,7 @@ class DQNTrainer:
         advised = greedy(prior, u[..., 2])
         copying = now.n_greedy_decisions < behavior.offset  # (S,)
         copying = copying.reshape(-1, *[1] * (own.ndim - 1))
-        own = np.where(copying & ~random, advised, own)
+        own = np.where(copying & (u[..., 0] >= epsilon), advised, own)
         return own, self._combined[advised, own]
 
     def update(self) -> None:
@@ -281,50 +247,41 @@ class DQNTrainer:
         now.deep.steps += 1
         if now.deep.steps % self.settings.target_update == 0:
             now.deep.copy_target()
-            now.replay.invalidate()
+            now.replay.valid[:] = False
 
     def pause(self) -> Pause:
         """The pause after a step, a snapshot if it is time to evaluate."""
-        if self.settings.is_evaluated(self.state.step):
+        now, trained = self.state, self.state.step - self.settings.random_steps
+        due = trained >= 0 and trained % self.settings.evaluate_every == 0
+        if due or now.step == self.settings.length:
             return self.snapshot()
-        return Pause(self.stage, self.stage.before + self.state.step, self.state)
+        return Pause(self.stage, self.stage.before + now.step, now)
 
     def snapshot(self) -> StepSnapshot:
         """The present snapshot; starts a new mean of the loss."""
-        now = self.state
-        finite = torch.isfinite(now.deep.online.flat).all(1).cpu().numpy()
-        failed = {
-            int(s): "non-finite loss" for s in np.flatnonzero(~np.isfinite(now.loss))
-        }
-        failed |= {int(s): "non-finite weights" for s in np.flatnonzero(~finite)}
-        failed |= now.lanes.failures  # one lane per seed
+        now, count = self.state, self.stage.before + self.state.step
+        weights = torch.isfinite(now.deep.online.flat).all(1).cpu().numpy()
+        failed: dict[int, str] = {}
+        for part, finite in (("loss", np.isfinite(now.loss)), ("weights", weights)):
+            lost = np.flatnonzero(~finite).tolist()
+            failed |= dict.fromkeys(lost, f"non-finite {part}")
         loss = now.loss / now.updates if now.updates else now.loss + np.nan
         now.loss, now.updates = np.zeros_like(loss), 0
-        return StepSnapshot(
-            self.stage,
-            self.stage.before + now.step,
-            now,
-            StageResult(self.start.total(now.deep), now.deep),
-            self._evaluated_policy(),
-            self.settings.evaluation_episodes,
-            loss,
-            failed=failed,
-        )
+        result = StageResult(self.start.total(now.deep), now.deep)
+        measured = (self._evaluated_policy, self.settings.evaluation_episodes, loss)
+        failed |= now.lanes.failures  # one lane per seed
+        return StepSnapshot(self.stage, count, now, result, *measured, failed=failed)
 
-    def _evaluated_policy(self) -> Policy:
-        """The present policy: half of the lanes explore, the other half is greedy.
+    def _evaluated_policy(self, states: Any, u: NDArray, alive: NDArray) -> NDArray:
+        """A `Policy`: half of the lanes explore, the other half is greedy.
 
         Greedy lanes do not reuse the prior (PPR).
         """
-        exploring = np.repeat([True, False], self.settings.evaluation_episodes)
-        epsilon = np.where(exploring, self.settings.evaluation_epsilon, 0.0)
-        start = self.start
-
-        def policy(states: NDArray, u: NDArray, alive: NDArray) -> NDArray:
-            base = self._values(start.base, states)  # (S, E, A)
-            same = start.prior is start.base
-            prior = base if same else self._values(start.prior, states)
-            residual = self._values(self.state.deep, states)
-            return self._choose(residual, base, prior, u, epsilon, exploring)[1]
-
-        return policy
+        start, settings = self.start, self.settings
+        exploring = np.repeat([True, False], settings.evaluation_episodes)
+        epsilon = np.where(exploring, settings.evaluation_epsilon, 0.0)
+        base = start.base(states, self.n_actions)  # (S, E, A)
+        same = start.prior is start.base
+        prior = base if same else start.prior(states, self.n_actions)
+        residual = self.state.deep(states, self.n_actions)
+        return self._choose(residual, (base, None, prior), u, epsilon, exploring)[1]

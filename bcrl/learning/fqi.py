@@ -1,7 +1,5 @@
 """Fitted Q-iteration, plain or boosted: every stage learns a residual on a base."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -84,11 +82,9 @@ class FQI:
             d.reward + shaping(v[d.state], v[d.next_state], d.absorbing, env.gamma)
             for d, v in zip(data, potential, strict=True)
         ]
-        models: list[list[Fitted | None]] = (
-            [list(row) for row in start.initial.models]
-            if isinstance(start.initial, FittedQ)
-            else [[None] * n_actions for _ in data]
-        )
+        models: list[list[Fitted | None]] = [[None] * n_actions for _ in data]
+        if isinstance(start.initial, FittedQ):
+            models = [list(row) for row in start.initial.models]
         # Q-values are not cached if noise makes every state new, nor in the Q-function
         # that the next stage uses as its base.
         noisy = env.step_noise or is_simulated(env)
@@ -106,9 +102,9 @@ class FQI:
                 )
                 for a, part in enumerate(d.by_action):
                     path = () if self.fixed_trees else (stage.number, k, a)
-                    fitted_to = (part.x, y[part.rows], part.multiplicity, part.queries)
+                    rows = (part.x, y[part.rows], part.multiplicity, part.queries)
                     if len(part.rows):  # an action that was never tried has no model
-                        problems[s, a] = Problem(*fitted_to, batch.seeds[s], path)
+                        problems[s, a] = Problem(*rows, batch.seeds[s], path)
             keep = not is_finite(env)  # a table is not queried between its points
             fits, lost = fit_each(self.regressor, problems, keep, batch.threads)
             failed = lost | failed
@@ -129,31 +125,25 @@ class FQI:
                 own = FittedQ([tuple(row) for row in models], self.regressor, batch)
                 last = start if k == self.iterations else cached
                 result = StageResult(last.total(own), own, data)
-            yield Iteration(
-                stage,
-                stage.before + k,
-                FQIState(k, data, residual, failed),
-                result,
-                [q[d.probe] for q, d in zip(total, data, strict=True)],
-                [r[d.probe] for r, d in zip(residual, data, strict=True)],
-                failed=failed,
+            now, count = FQIState(k, data, residual, failed), stage.before + k
+            probed = (
+                [values[d.probe] for values, d in zip(each, data, strict=True)]
+                for each in (total, residual)
             )
+            yield Iteration(stage, count, now, result, *probed, failed=failed)
 
     def _collect(self, stage: Stage, start: StageInit, batch: SeedBatch) -> FQIState:
         """The state before the first iteration, with a dataset for each seed."""
-        previous, n = start.previous, len(batch.seeds)
+        env, previous, n = stage.env, start.previous, len(batch.seeds)
         if not self.new_data and previous is not None:
             return FQIState(0, previous.data, None, {})
+        rngs = [stream(seed, "data", stage.number) for seed in batch.seeds]
         if self.shared_data:
             rngs = [stream(0, "shared_data", stage.task)]
-        else:
-            rngs = [stream(seed, "data", stage.number) for seed in batch.seeds]
-        first, u = rollout.starts_and_draws(rngs, stage.env, self.episodes)
+        first, u = rollout.starts_and_draws(rngs, env, self.episodes)
         q = ZERO if previous is None else previous.q
-        episodes = rollout.rollout(stage.env, q, first, u, self.epsilon)
-        data = [
-            dataset.build(stage.env, episodes, s, batch.probe) for s in range(len(rngs))
-        ]
+        episodes = rollout.rollout(env, q, first, u, self.epsilon)
+        data = [dataset.build(env, episodes, s, batch.probe) for s in range(len(rngs))]
         failed = episodes.failed
         if self.shared_data:
             data *= n

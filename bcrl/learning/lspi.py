@@ -1,7 +1,5 @@
 """Least-squares policy iteration with quadratic features (Lagoudakis and Parr 2003)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -62,8 +60,8 @@ class LSPI:
         """Episodes per iteration; ConfigError unless `steps` are whole episodes."""
         episodes, rest = divmod(self.steps, self.iterations * env.horizon)
         if rest or not episodes:
-            why = f"LSPI needs a multiple of {self.iterations} iterations"
-            why += f" x {env.horizon} steps"
+            unit = f"{self.iterations} iterations x {env.horizon} steps"
+            why = f"LSPI needs a multiple of {unit}"
             raise ConfigError("algorithm.steps", self.steps, why)
         return episodes
 
@@ -77,48 +75,38 @@ class LSPI:
             state = LSPIState(0, np.zeros((n, k, d)), ZERO, {})
             yield self._snapshot(stage, state)
         for i in range(state.iteration + 1, self.iterations + 1):
-            z, next_z, reward = self._collect(stage, state.gain, i, batch)
-            transitions = zip(z, next_z, reward, strict=True)
-            theta = [lstdq(*x, env.gamma, self.features) for x in transitions]
-            q = Quadratic.from_weights(
-                np.stack(theta), self.features, d + k, env.actions
-            )
+            transitions = zip(*self._collect(stage, state.gain, i, batch), strict=True)
+            theta = np.stack([lstdq(*x, env.gamma, self.features) for x in transitions])
+            q = Quadratic.from_weights(theta, self.features, d + k, env.actions)
             better = [improved(matrix, env) for matrix in q.matrix]
             gain = np.stack([np.zeros((k, d)) if x is None else x for x in better])
-            why = f"LSPI found no stabilising gain in iteration {i}"
             lost = [s for s, x in enumerate(better) if x is None]
+            why = f"LSPI found no stabilising gain in iteration {i}"
             failed = dict.fromkeys(lost, why) | state.failed
             state = LSPIState(i, gain, q, failed)
             yield self._snapshot(stage, state)
 
     def _snapshot(self, stage: Stage, state: LSPIState) -> StepSnapshot:
-        return StepSnapshot(
-            stage,
-            stage.before + state.iteration * self.length // self.iterations,
-            state,
-            StageResult(state.q, state.q),
-            _linear(state.gain),  # without noise, so its exploring half is greedy, too
-            self.evaluation_episodes,
-            np.full(len(state.gain), np.nan),
-            failed=state.failed,
-        )
+        count = stage.before + state.iteration * self.length // self.iterations
+        result, loss = StageResult(state.q, state.q), np.full(len(state.gain), np.nan)
+        policy = _linear(state.gain)  # without noise, so both halves are greedy
+        measured = (policy, self.evaluation_episodes, loss)
+        return StepSnapshot(stage, count, state, result, *measured, failed=state.failed)
 
     def _collect(
         self, stage: Stage, gain: Floats, iteration: int, batch: SeedBatch
     ) -> tuple[Floats, Floats, Floats]:
         """Each seed's (s, a) (S, n, m), next (s', K s') and rewards (S, n)."""
-        env, k = stage.env, gain.shape[1]
+        env, (n, k, d) = stage.env, gain.shape
         rngs = [stream(x, "data", stage.number, iteration) for x in batch.seeds]
         start, u = starts_and_draws(rngs, env, self.episodes_per_iteration(env), k)
         episodes = play(env, _linear(gain, self.noise_std), start, u)
         cut = env.horizon - 1 if self.drop_last else env.horizon
-        state = episodes.state[:, :, :cut]  # (S, E, T, d)
-        next_state = episodes.state[:, :, 1 : cut + 1]
+        state, next_state = (episodes.state[:, :, i : cut + i] for i in (0, 1))
         z = np.concatenate([state, episodes.action[:, :, :cut]], -1)  # (S, E, T, m)
         next_z = np.concatenate([next_state, _apply(gain, next_state)], -1)
-        n, m = len(gain), z.shape[-1]
         reward = episodes.reward[:, :, :cut].reshape(n, -1)
-        return z.reshape(n, -1, m), next_z.reshape(n, -1, m), reward
+        return z.reshape(n, -1, d + k), next_z.reshape(n, -1, d + k), reward
 
 
 def lstdq(z: Floats, next_z: Floats, reward: Floats, gamma: float, kind: str) -> Floats:

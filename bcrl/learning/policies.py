@@ -1,7 +1,5 @@
 """Policies as pure functions of action values and uniform draws."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 
@@ -31,27 +29,32 @@ def _best(q, u):
 
 
 @kept(nogil=True)
-def _best_of_each(q, u):
+def _choices(q, explore, u, epsilon):
     action = np.empty(len(q), np.intp)
     for i in range(len(q)):
-        action[i] = _best(q[i], u[i])
+        action[i] = int(u[i] * q.shape[1])
+        if explore[i] >= epsilon[i % len(epsilon)]:
+            action[i] = _best(q[i], u[i])
     return action
+
+
+def epsilon_greedy(
+    q: Floats, explore: Floats, u: Floats, epsilon: Floats | float
+) -> Integers:
+    """`uniform` where `explore` (...) is below ε (a number, or one per last index)."""
+    rows = writable(q).reshape(-1, q.shape[-1])
+    drawn = (np.array(x, np.float64, order="C").ravel() for x in (explore, u, epsilon))
+    return _choices(rows, *drawn).reshape(u.shape)
 
 
 def greedy(q: Floats, u: Floats) -> Integers:
     """The best action of q (..., A); ties are broken uniformly by u (...) in [0, 1)."""
-    rows = writable(q).reshape(-1, q.shape[-1])
-    return _best_of_each(rows, writable(u).reshape(-1)).reshape(u.shape)
+    return epsilon_greedy(q, u, u, 0.0)
 
 
 def uniform(n_actions: int, u: Floats) -> Integers:
     """A uniformly random action from each u (...) in [0, 1)."""
     return (u * n_actions).astype(np.intp)
-
-
-def annealed(step: int, first: float, last: float, over: int) -> float:
-    """ε at a step: it falls linearly from `first` to `last` within `over` steps."""
-    return last if step >= over else first + (last - first) * step / over
 
 
 def combined_actions(actions: Floats) -> Integers:
@@ -77,24 +80,19 @@ def walk(next_row, reward, absorbing, q, first, u, epsilon):
     Returns rows (E, T + 1), actions (E, T) and lengths (E,).
     """
     horizon, episodes = u.shape[0], u.shape[1]
-    n_actions = q.shape[1]
     row = np.empty((episodes, horizon + 1), np.intp)
     action = np.zeros((episodes, horizon), np.intp)
     length = np.zeros(episodes, np.intp)
     for e in range(episodes):
-        at = first[e]
+        at, done = first[e], False
         row[e, 0] = at
         for t in range(horizon):
-            if u[t, e, 0] < epsilon:
-                act = int(u[t, e, 1] * n_actions)
-            else:
-                act = _best(q[at], u[t, e, 1])
-            action[e, t] = act
-            length[e] = t + 1
-            done = absorbing[at, act]
-            at = next_row[at, act]
+            if not done:
+                act = int(u[t, e, 1] * q.shape[1])
+                if u[t, e, 0] >= epsilon:
+                    act = _best(q[at], u[t, e, 1])
+                action[e, t] = act
+                length[e] = t + 1
+                at, done = next_row[at, act], absorbing[at, act]
             row[e, t + 1] = at
-            if done:
-                break
-        row[e, length[e] + 1 :] = at
     return row, action, length

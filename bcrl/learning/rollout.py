@@ -1,7 +1,5 @@
 """Episodes of many seeds in lockstep, for data collection and evaluation."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 from collections.abc import Callable, Sequence
@@ -38,8 +36,7 @@ class Episodes:
 
     def discounted_return(self, gamma: float) -> Floats:
         """Σ_t γ^t r_t of each episode, shape (S, E)."""
-        steps = np.arange(self.reward.shape[-1])
-        return (self.reward * gamma**steps).sum(-1)
+        return (self.reward * gamma ** np.arange(self.reward.shape[-1])).sum(-1)
 
     def solved(self, success: Success | str = "unpunished") -> Booleans:
         """Whether each episode was a success by a rule of `env.success`, (S, E)."""
@@ -57,35 +54,24 @@ class Episodes:
         return outcomes.get(rule, ended & (reward >= 0.0))
 
 
+def starts_and_draws(
+    rngs: Sequence[np.random.Generator], env: Env, episodes: int, choices: int = 2
+) -> tuple[Floats, Floats]:
+    """Random starts (S, E, d) by `env.initial`, and then `draws` (S, T, E, …)."""
+    noise = np.stack([rng.random((episodes, env.initial_noise)) for rng in rngs])
+    return env.initial(noise), draws(rngs, env, episodes, choices)
+
+
 def draws(
-    rng: np.random.Generator, env: Env, episodes: int, choices: int = 2
+    rngs: Sequence[np.random.Generator], env: Env, episodes: int, choices: int = 2
 ) -> Floats:
-    """All uniforms of one seed's episodes, shape (T, E, choices + step_noise).
+    """All uniforms of S seeds' episodes, (S, T, E, choices + step_noise).
 
     Entry 0 decides whether to explore, entry 1 picks the random action or breaks ties,
     the last ones are the environment's noise. Unused ones are drawn, too.
     """
-    return rng.random((env.horizon, episodes, choices + env.step_noise))
-
-
-def start_states(rng: np.random.Generator, env: Env, episodes: int) -> Floats:
-    """Random starts of one seed's episodes, by `env.initial`, shape (E, d)."""
-    return env.initial(rng.random((episodes, env.initial_noise)))
-
-
-def starts_and_draws(
-    rngs: Sequence[np.random.Generator], env: Env, episodes: int, choices: int = 2
-) -> tuple[Floats, Floats]:
-    """`start_states` (S, E, d) and then `draws` (S, T, E, …) of S seeds."""
-    start = np.stack([start_states(rng, env, episodes) for rng in rngs])
-    return start, np.stack([draws(rng, env, episodes, choices) for rng in rngs])
-
-
-def evaluation_starts(rng: np.random.Generator, env: Env) -> Floats:
-    """Starts (E, d) of FQI's greedy evaluation: fixed, but a simulator's are random."""
-    if is_simulated(env):
-        return start_states(rng, env, env.starts)
-    return env.evaluation_states()
+    shape = (env.horizon, episodes, choices + env.step_noise)
+    return np.stack([rng.random(shape) for rng in rngs])
 
 
 def success_of(env: Env) -> Success:
@@ -99,13 +85,7 @@ def success_of(env: Env) -> Success:
 Policy = Callable[[NDArray, NDArray, NDArray], NDArray]
 
 
-def rollout(
-    env: Env,
-    q: Q,
-    start: Floats,
-    u: Floats,
-    epsilon: float = 0.0,
-) -> Episodes:
+def rollout(env: Env, q: Q, start: Floats, u: Floats, epsilon: float = 0.0) -> Episodes:
     """ε-greedy episodes from start (S, E, d) with uniforms u (S, T, E, 2 + noise)."""
     if is_finite(env) and isinstance(q, Table):
         return _tabular_rollout(env, q, start, u, epsilon)
@@ -132,10 +112,16 @@ def play(env: Env, policy: Policy, start: Floats, u: Floats) -> Episodes:
     state = np.zeros((horizon + 1, *shape[1:], env.state_dim))
     action: NDArray = np.zeros(0)  # its shape and type are the policy's
     reward, absorbing = np.zeros(shape), np.zeros(shape, bool)
-    length = np.zeros(shape[1:], np.intp)
+    length, reported = np.zeros(shape[1:], np.intp), None
     failed: dict[int, str] = {}
-    reported = None
-    for part in _parts(env, n_seeds, n_episodes):
+    # Few simulators run at the same time; the policy always sees the states of all.
+    seeds, at_once = n_seeds, n_episodes
+    if is_simulated(env):
+        at_once = min(EPISODES, AT_ONCE)
+        seeds = AT_ONCE // at_once
+    parts = itertools.product(range(0, n_seeds, seeds), range(0, n_episodes, at_once))
+    for s, e in parts:
+        part = (slice(s, s + seeds), slice(e, e + at_once))
         lanes = lanes_of(env)
         state[0][part] = lanes.begin(start[part])
         alive = np.zeros(shape[1:], bool)
@@ -144,29 +130,26 @@ def play(env: Env, policy: Policy, start: Floats, u: Floats) -> Episodes:
             choice = policy(state[t], u[:, t], alive)
             if not action.size:
                 action = np.zeros((*shape, *choice.shape[2:]), choice.dtype)
-            running = alive[part]
+            running, now = alive[part], state[t][part]
             # A mask copies, slices do not.
             live = (slice(None), slice(None)) if running.all() else (running.copy(),)
-            noise = u[:, t, :, width - env.step_noise :][part]
-            now = state[t][part]
-            after, r, done, cut = lanes.step(
-                now[live], choice[part][live], noise[live], live
-            )
+            noise = u[:, t, :, width - env.step_noise :][part][live]
+            result = lanes.step(now[live], choice[part][live], noise, live)
             action[t][part] = choice[part]
             state[t + 1][part] = now
-            state[t + 1][part][live] = after
-            reward[t][part][live], absorbing[t][part][live] = r, done
+            state[t + 1][part][live] = result[0]
+            reward[t][part][live], absorbing[t][part][live] = result[1:3]
             length[part][live] += 1
-            running[live] = ~(done | cut)
+            running[live] = ~(result[2] | result[3])
             if not running.any():
                 break
         if (succeeded := getattr(lanes, "succeeded", None)) is not None:
             reported = np.zeros(shape[1:], bool) if reported is None else reported
             reported[part] = succeeded
         lanes.close()
-        first_seed, in_part = part[0].start or 0, start[part].shape[1]
+        width_of_part = start[part].shape[1]
         failures = lanes.failures.items()
-        failed = {first_seed + lane // in_part: why for lane, why in failures} | failed
+        failed = {s + lane // width_of_part: why for lane, why in failures} | failed
     state, action, reward, absorbing = (
         # Contiguous, because sums over strided axes depend on the number of lanes.
         np.ascontiguousarray(np.moveaxis(part, 0, 2))
@@ -175,28 +158,10 @@ def play(env: Env, policy: Policy, start: Floats, u: Floats) -> Episodes:
     return Episodes(state, action, reward, absorbing, length, start, failed, reported)
 
 
-def _parts(env: Env, n_seeds: int, n_episodes: int) -> list[tuple[slice, slice]]:
-    """Lanes (seeds, episodes) that run at the same time: all, but few simulators.
-
-    The states that Q is queried at together must not depend on the number of seeds.
-    """
-    if not is_simulated(env):
-        return [(slice(None), slice(None))]
-    episodes = min(EPISODES, AT_ONCE)
-    seeds = AT_ONCE // episodes
-    corners = itertools.product(
-        range(0, n_seeds, seeds), range(0, n_episodes, episodes)
-    )
-    return [(slice(s, s + seeds), slice(e, e + episodes)) for s, e in corners]
-
-
 @functools.lru_cache(maxsize=64)
-def transition_tables(
-    env: FiniteEnv,
-) -> tuple[Integers, Floats, Booleans]:
+def transition_tables(env: FiniteEnv) -> tuple[Integers, Floats, Booleans]:
     """Next row, reward and absorption of a finite deterministic env, each (N, A)."""
-    states = env.states()
-    every = np.repeat(states[:, None], env.n_actions, axis=1)
+    every = np.repeat(env.states()[:, None], env.n_actions, axis=1)
     actions = np.broadcast_to(np.arange(env.n_actions), every.shape[:2])
     after, reward, absorbing = env.step(every, actions)
     return rows_of(env, after), reward, absorbing
@@ -206,15 +171,12 @@ def _tabular_rollout(
     env: FiniteEnv, q: Table, start: NDArray, u: NDArray, epsilon: float
 ) -> Episodes:
     """`rollout` on a finite environment, row by row in compiled code."""
-    tables = transition_tables(env)
-    first = rows_of(env, start)
-    walked = [
-        walk(*tables, values, first[s], u[s], epsilon)
-        for s, values in enumerate(q.values)
-    ]
+    tables, first = transition_tables(env), rows_of(env, start)
+    seeds = zip(q.values, first, u, strict=True)
+    walked = [walk(*tables, *seed, epsilon) for seed in seeds]
     row, action, length = (np.stack(part) for part in zip(*walked, strict=True))
     void = np.arange(u.shape[1]) >= length[..., None]
-    _, reward, absorbing = (table[row[..., :-1], action] for table in tables)
+    reward, absorbing = (table[row[..., :-1], action] for table in tables[1:])
     reward[void], absorbing[void] = 0.0, False
     bad = [s for s, values in enumerate(q.values) if not np.isfinite(values).all()]
     failed = dict.fromkeys(bad, NOT_FINITE)

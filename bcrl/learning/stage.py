@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol
 
 from bcrl.common.serialization import storable
@@ -23,40 +23,6 @@ class SeedBatch:
     probe: Floats  # (n_probe, d) states at which Q is recorded
     threads: int = 1
     device: str = "cpu"
-
-
-@dataclass(frozen=True)
-class Pause:
-    """A point at which learning can be interrupted and resumed."""
-
-    stage: Stage
-    count: int  # iterations or environment steps since the run began
-    state: Any  # the learner's state, valid until learning continues
-
-
-@dataclass(frozen=True)
-class Snapshot(Pause):
-    """A pause at which the learned Q-functions can be evaluated."""
-
-    result: StageResult
-    #: Seeds that cannot continue, by index in the batch, and why.
-    failed: dict[int, str] = field(default_factory=dict, kw_only=True)
-
-    @property
-    def last_of_stage(self) -> bool:
-        """Whether the stage is complete."""
-        return self.count == self.stage.before + self.stage.learner.length
-
-
-@dataclass(frozen=True)
-class StepSnapshot(Snapshot):
-    """A snapshot of a learner that counts environment steps."""
-
-    policy: (
-        Policy  # of 2 · `episodes` lanes: the first half explores, the rest is greedy
-    )
-    episodes: int
-    loss: Floats  # (S,) mean since the last snapshot; nan without updates
 
 
 class Learner(Protocol):
@@ -89,6 +55,38 @@ class Stage:
     before: int  # iterations or environment steps of all previous stages
 
 
+@dataclass(frozen=True)
+class Pause:
+    """A point at which learning can be interrupted and resumed."""
+
+    stage: Stage
+    count: int  # iterations or environment steps since the run began
+    state: Any  # the learner's state, valid until learning continues
+
+
+@dataclass(frozen=True)
+class Snapshot(Pause):
+    """A pause at which the learned Q-functions can be evaluated."""
+
+    result: StageResult
+    #: Seeds that cannot continue, by index in the batch, and why.
+    failed: dict[int, str] = field(default_factory=dict, kw_only=True)
+
+    @property
+    def last_of_stage(self) -> bool:
+        """Whether the stage is complete."""
+        return self.count == self.stage.before + self.stage.learner.length
+
+
+@dataclass(frozen=True)
+class StepSnapshot(Snapshot):
+    """A snapshot of a learner that counts environment steps."""
+
+    policy: Policy  # of 2 · `episodes` lanes: one half explores, the other is greedy
+    episodes: int
+    loss: Floats  # (S,) mean since the last snapshot; nan without updates
+
+
 @storable
 @dataclass(frozen=True)
 class RunState:
@@ -102,55 +100,40 @@ class RunState:
     state: Any = None
 
 
+@dataclass
 class CurriculumRun:
     """Learns stages in order; transfers start each one from the result before it."""
 
-    def __init__(
-        self, stages: Sequence[Stage], batch: SeedBatch, state: RunState | None = None
-    ) -> None:
-        self.stages, self.batch = stages, batch
-        self._completed = state or RunState(0, None)  # when the present stage began
-        self._pause: Pause | None = None
+    stages: Sequence[Stage]
+    batch: SeedBatch
+    state: RunState = RunState(0, None)  # with the latest pause's a new run resumes
 
     def __iter__(self) -> Iterator[Pause]:
-        for stage in self.stages[self._completed.stages :]:
-            start = begin(stage.transfers, self._completed.result)
-            state, pause = self._completed.state, None
-            for pause in stage.learner.learn(stage, start, self.batch, state):
-                self._pause = pause
+        for stage in self.stages[self.state.stages :]:
+            now, done = self.state, False
+            start = begin(stage.transfers, now.result)
+            for pause in stage.learner.learn(stage, start, self.batch, now.state):
+                if isinstance(pause, Snapshot) and pause.last_of_stage:
+                    now, done = RunState(stage.number, pause.result), True
+                else:
+                    now, done = RunState(now.stages, now.result, pause.state), False
+                self.state = now
                 yield pause
-            if not (isinstance(pause, Snapshot) and pause.last_of_stage):
+            if not done:
                 name = getattr(stage.learner, "name", type(stage.learner).__name__)
                 why = "must end with a Snapshot whose last_of_stage is true"
                 raise BcrlError(f"{name}.learn: stage {stage.number} {why}")
-            self._completed = RunState(stage.number, pause.result)
-
-    @property
-    def state(self) -> RunState:
-        """What a new `CurriculumRun` needs to resume from the latest pause."""
-        pause = self._pause
-        if pause is None:
-            return self._completed
-        if isinstance(pause, Snapshot) and pause.last_of_stage:
-            return RunState(pause.stage.number, pause.result)
-        return replace(self._completed, state=pause.state)
 
     @property
     def given(self) -> list[Any]:
         """What a stored `state` refers to and does not contain: settings, tasks."""
-        settings = (
-            part
-            for stage in self.stages
-            for part in (stage.env, *vars(stage.learner).values())
-        )
-        return [ZERO, self.batch, *settings]
-
-
-def snapshots(pauses: Iterable[Pause]) -> Iterator[Snapshot]:
-    """The pauses that are snapshots."""
-    return (pause for pause in pauses if isinstance(pause, Snapshot))
+        found = [ZERO, self.batch]
+        for stage in self.stages:
+            found += stage.env, *vars(stage.learner).values()
+        return found
 
 
 def learn(stages: Sequence[Stage], batch: SeedBatch) -> Iterator[Snapshot]:
     """The snapshots of a whole run."""
-    return snapshots(CurriculumRun(stages, batch))
+    run = CurriculumRun(stages, batch)
+    return (pause for pause in run if isinstance(pause, Snapshot))

@@ -115,8 +115,7 @@ class StageInit:
 
     def memoized(self) -> StageInit:
         """The same with a base and a potential that cache their values."""
-        base = memoized(self.base)
-        same = self.potential is self.base
+        base, same = memoized(self.base), self.potential is self.base
         potential = base if same else memoized(self.potential)
         return replace(self, base=base, potential=potential)
 
@@ -135,12 +134,13 @@ def begin(transfers: Sequence[Transfer], previous: StageResult | None) -> StageI
     Raises ConfigError for a transfer that does not return a `StageInit`.
     """
     start = StageInit(previous)
-    if previous is not None:
-        for transfer in transfers:
-            start = transfer(start, previous)
-            if not isinstance(start, StageInit):
-                why = "must return a StageInit (bcrl.learning.transfer), returned "
-                raise ConfigError("transfer", transfer, f"{why}{start!r:.80}")
+    if previous is None:
+        return start
+    for transfer in transfers:
+        start = transfer(start, previous)
+        if not isinstance(start, StageInit):
+            why = f"must return a bcrl.learning.transfer.StageInit, not {start!r:.80}"
+            raise ConfigError("transfer", transfer, why)
     return start
 
 

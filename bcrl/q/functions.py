@@ -34,7 +34,8 @@ def each(states: Sequence[NDArray], values: Callable[[int], NDArray]) -> Values:
 
 def check_width(states: Sequence[NDArray], d: int) -> None:
     """Raise BcrlError unless all states have `d` entries, as compiled code needs."""
-    for width in {x.shape[-1] for x in states}:
+    stacked = isinstance(states, np.ndarray)
+    for width in {x.shape[-1] for x in (states[:1] if stacked else states)}:
         if width != d:
             raise BcrlError(
                 f"a Q-function of states with {d} entries can't be evaluated at states "

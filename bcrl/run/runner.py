@@ -108,7 +108,7 @@ def _prepare(plan: Plan, quiet: bool) -> None:
 
 
 def _search_references(plans: Sequence[Plan]) -> None:
-    """Search Q* of every task whose metrics need it: once, and kept on disk."""
+    """Search Q* of every task whose metrics need it: BcrlError if that fails."""
     tasks: dict[Any, None] = {}
     for plan in plans:
         measured = plan.metrics if plan.family == "FQI" else ()

@@ -16,12 +16,12 @@ from bcrl.envs.checks import unresolved
 from bcrl.envs.gymnasium import default_success
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.evaluation.step_metrics import evaluate
-from bcrl.learning.rollout import draws, play, start_states, success_of
-from bcrl.learning.stage import SeedBatch, snapshots
+from bcrl.learning.rollout import play, starts_and_draws, success_of
+from bcrl.learning.stage import SeedBatch
 from bcrl.learning.transfer import StageInit
 from bcrl.q.quadratic import Quadratic
 from tests.conftest import plan, plans
-from tests.toys import last
+from tests.toys import last, snapshots
 
 CAR = {"id": "MountainCar-v0", "horizon": 40}
 CURRICULA = ("mountain_car", "cart_pole", "acrobot")
@@ -69,14 +69,13 @@ gymnasium.register("tests/Scored-v0", Scored, max_episode_steps=9)
 def played(task, episodes=3):
     """Random episodes of seed 0, and the seeds of their resets."""
     rng = stream(0, "data", 1)
-    start = start_states(rng, task, episodes)
-    u = draws(rng, task, episodes)[None]
+    start, u = starts_and_draws([rng], task, episodes)
 
     def policy(now, u, alive):
         return (u[..., 1] * task.n_actions).astype(np.intp)
 
-    resets = [int(number * 2**31) for number in start[:, 0]]
-    return play(task, policy, start[None], u), resets
+    resets = [int(number * 2**31) for number in start[0, :, 0]]
+    return play(task, policy, start, u), resets
 
 
 def test_terminated_is_absorbing_and_truncated_is_not():
@@ -119,7 +118,7 @@ def test_q_mean_is_that_of_the_first_observations():
             x = functional.linear(x, weights.T, flat[at - n_out : at])
             x = functional.relu(x) if layer < 2 else x
         expected = x.max(-1).values.mean().item()
-        found = evaluate(now, team.seeds)[1]["q_mean"]
+        found = evaluate(now, team.seeds)[0][1]["q_mean"]
         assert found == pytest.approx(expected, rel=1e-5)
 
 

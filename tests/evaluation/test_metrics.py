@@ -9,30 +9,9 @@ from bcrl.envs.car_on_hill import CarOnHill
 from bcrl.envs.maze import Maze
 from bcrl.errors import ConfigError
 from bcrl.evaluation import oracle
-from bcrl.evaluation.metrics import METRICS, View, check_metrics, probed_states
+from bcrl.evaluation.metrics import check_metrics
 from bcrl.run import runner
 from tests.conftest import plan
-
-
-def test_the_metrics_by_hand():
-    view = View(
-        q=np.array([[1.0, 3.0], [5.0, 5.0], [0.0, -2.0]]),
-        residual=np.array([[0.5, 1.5], [0.0, 0.0], [9.0, 9.0]]),
-        returns=np.array([2.0, 4.0]),
-        solved=np.array([True, False]),
-        start=np.array([0]),
-        reference=np.array([1, 2]),
-        q_star=np.array([[4.0, 5.0], [1.0, 0.0]]),
-        optimum=10.0,
-    )
-    found = {name: metric(view) for name, metric in METRICS.items()}
-    assert found == {
-        "return": 3.0,
-        "q_error": (1 + 0 + 1 + 2) / 4,
-        "q_error_start": (9 + 7) / 2,
-        "residual_start": 1.0,
-        "solved": 0.5,
-    }
 
 
 def test_a_maze_run_recomputed_from_its_arrays(tmp_path):
@@ -56,13 +35,6 @@ def test_a_maze_run_recomputed_from_its_arrays(tmp_path):
     discount = 0.99 ** np.arange(len(reward))
     assert row["return"] == pytest.approx((discount * reward).sum())
     assert row["solved"] == float(reward[-1] == 5.0)
-
-
-def test_the_hill_is_measured_on_its_grid():
-    grid = CarOnHill().evaluation_states()
-    asked = probed_states(CarOnHill(mass=1.2))
-    assert {tuple(s) for s in asked.tolist()} == {tuple(s) for s in grid.tolist()}
-    assert oracle.reference(CarOnHill(mass=1.2)).q.shape == (100, 2)
 
 
 @pytest.mark.parametrize("metrics", [["retrun"], [["return"]], ["q_error_start"]])

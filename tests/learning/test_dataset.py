@@ -5,15 +5,14 @@ import pytest
 
 from bcrl.common.seeding import stream
 from bcrl.learning import dataset
-from bcrl.learning.rollout import draws, rollout, start_states
+from bcrl.learning.rollout import rollout, starts_and_draws
 from bcrl.q.functions import ZERO
 from tests.toys import Corridor, OpenCorridor
 
 
 @pytest.mark.parametrize("env", [Corridor(), OpenCorridor()])
 def test_the_dataset_is_the_episodes_with_repetitions_counted(env):
-    rng = stream(0, "data")
-    start, u = start_states(rng, env, 40)[None], draws(rng, env, 40)[None]
+    start, u = starts_and_draws([stream(0, "data")], env, 40)
     played = rollout(env, ZERO, start, u, 1.0)
     probe = np.array([[2.0], [0.0]])
     d = dataset.build(env, played, 0, probe)

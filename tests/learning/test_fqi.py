@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from bcrl.evaluation.oracle.maze import optimal_q
-from bcrl.learning.bellman import residual_target
 from bcrl.learning.fqi import FQI
 from bcrl.learning.rollout import transition_tables
 from bcrl.learning.stage import SeedBatch, Stage
@@ -36,17 +35,6 @@ def stages(
 def learn(tasks, *transfers, seeds=(0, 1), **options):
     batch = SeedBatch(seeds, Corridor().states())
     return list(learn_stages(stages(tasks, transfers, **options), batch))
-
-
-def test_the_target_is_equation_5_by_hand():
-    y = residual_target(
-        reward=np.array([1.0, -2.0]),
-        absorbing=np.array([False, True]),
-        next_q=np.array([[3.0, 4.0], [9.0, 9.0]]),
-        base=np.array([0.5, 0.25]),
-        gamma=0.5,
-    )
-    assert y.tolist() == [1.0 + 0.5 * 4.0 - 0.5, -2.0 - 0.25]
 
 
 @pytest.mark.parametrize(

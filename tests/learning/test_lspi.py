@@ -49,7 +49,6 @@ def test_the_last_gain_is_riccatis_within_a_hundredth():
     *_, final = iterations(range(10))
     best = riccati_gain(LQ)
     off = gains(final, 10) - best
-    assert (np.linalg.norm(off, axis=(1, 2)) / np.linalg.norm(best)).max() < 0.01
     # Worst entry, relative to the largest: half of the optimal entries are zero.
     assert np.abs(off).max() / np.abs(best).max() < 0.01
     own = np.abs(best) > 1.0
@@ -69,7 +68,7 @@ def test_the_papers_readings_learn_it_too(kind):
 
 
 def test_learning_pays_and_counts_its_steps():
-    seen = [(x, evaluate(x, (0, 1))) for x in iterations((0, 1), before=70)]
+    seen = [(x, evaluate(x, (0, 1))[0]) for x in iterations((0, 1), before=70)]
     assert [x.count for x, _ in seen] == [70, 570, 1070, 1570, 2070]
     assert [x.last_of_stage for x, _ in seen] == [False] * 4 + [True]
     for s in range(2):
@@ -141,16 +140,6 @@ def test_a_gain_that_pushes_away_or_is_not_finite_is_rejected(where, value):
     assert improved(matrix, LQ) is None
 
 
-def test_positions_are_where_the_environment_says():
-    class Swapped(LinearSystem):
-        positions = (1, 3)
-
-    matrix = good_matrix()
-    matrix[4, 1] = matrix[1, 4] = -matrix[4, 1]  # the gain on a velocity changes sign
-    assert improved(matrix, LQ) is not None
-    assert improved(matrix, Swapped("lq")) is None
-
-
 @pytest.mark.parametrize("returned", [None, -1e5])
 def test_a_seed_that_fails_is_named_and_the_others_are_as_without_it(
     monkeypatch, returned
@@ -202,12 +191,8 @@ def test_a_seed_alone_is_the_same_among_others():
         assert np.array_equal(values[0][0], values[1][3])
 
 
-def test_the_horizon_is_the_environments():
-    short = replace(LQ, horizon=50)
+def test_steps_that_are_not_whole_episodes_are_rejected():
     learner = LSPI(iterations=2, steps=300)
-    *_, final = iterations((0,), learner, short)
-    assert learner.episodes_per_iteration(short) == 3
-    assert final.count == learner.length == 300
-    for wrong in (LQ, replace(LQ, horizon=200)):  # 2 x 100 does not divide 300
-        with pytest.raises(ConfigError, match=r"algorithm\.steps=300"):
-            iterations((0,), learner, wrong)
+    assert learner.episodes_per_iteration(replace(LQ, horizon=50)) == 3
+    with pytest.raises(ConfigError, match=r"algorithm\.steps=300"):
+        iterations((0,), learner, LQ)  # 2 x 100 does not divide 300

@@ -11,8 +11,7 @@ from threadpoolctl import threadpool_limits
 from torch.nn import functional
 
 from bcrl.common.seeding import stream
-from bcrl.learning.dqn_update import batched, one_by_one
-from bcrl.learning.replay import Replay
+from bcrl.learning.replay import Replay, batched, one_by_one
 from bcrl.q.networks import cpu
 from bcrl.q.networks.mlp import Adam, DeepQ, Networks, xavier
 
@@ -140,7 +139,7 @@ def test_an_update_uses_the_current_target_and_the_current_rows(way):
     for step in range(steps):
         if step in (3, 6):
             deep.copy_target()
-            replay.invalidate()
+            replay.valid[:] = False
         if step == 5:  # the oldest rows are overwritten, the rest of the ring too
             for i in range(replay.capacity):
                 cut = np.cumsum([D, D, A, 1, 1])

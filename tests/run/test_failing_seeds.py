@@ -13,7 +13,7 @@ from bcrl.evaluation.metrics import Probe
 from bcrl.evaluation.step_metrics import StepProbe
 from bcrl.learning.dqn import DQN
 from bcrl.learning.fqi import FQI
-from bcrl.learning.rollout import start_states
+from bcrl.learning.rollout import starts_and_draws
 from bcrl.learning.stage import CurriculumRun, Snapshot, Stage, learn
 from bcrl.learning.transfer import Boost, warm_start
 from bcrl.q.functions import Table
@@ -144,8 +144,8 @@ def test_files_and_exit_code_of_a_seed_that_failed(tmp_path, monkeypatch):
 
 def numbers(seed, purpose, *path, episodes):
     """What resets the episodes of a seed and a purpose."""
-    found = start_states(stream(seed, purpose, *path), Simulated(), episodes)
-    return tuple(found[:, 0].tolist())
+    rngs = [stream(seed, purpose, *path)]
+    return tuple(starts_and_draws(rngs, Simulated(), episodes)[0].ravel().tolist())
 
 
 def fqi(env):

@@ -1,57 +1,30 @@
 """Exact optimal action values, to measure learned ones against."""
 
-from __future__ import annotations
-
-import functools
-import importlib
-import pkgutil
-from dataclasses import dataclass
+from functools import lru_cache
 from types import ModuleType
+from typing import NamedTuple
 
 from bcrl.envs.base import Env
+from bcrl.evaluation.oracle import car_on_hill, maze
 from bcrl.learning import Floats
 
-
-@dataclass(frozen=True, eq=False)
-class Reference:
-    """Q* of one task: `states` (n, d) and `q` (n, A); both arrays are read-only."""
-
-    states: Floats
-    q: Floats
-
-    def __post_init__(self) -> None:
-        self.states.setflags(write=False)
-        self.q.setflags(write=False)
+#: name → the module whose functions `reference` and `table` know Q* of its `ENV`
+ORACLES: dict[str, ModuleType] = {"car_on_hill": car_on_hill, "maze": maze}
 
 
-@functools.cache
-def oracles() -> dict[str, ModuleType]:
-    """The oracles by name: modules of this package with an environment class `ENV`.
+class Reference(NamedTuple):
+    """Q* of one task."""
 
-    Each one has functions `reference` and `table`.
-    """
-    names = [module.name for module in pkgutil.iter_modules(__path__)]
-    found = {
-        name: importlib.import_module(f"{__name__}.{name}")
-        for name in names
-        if not name.startswith("_")
-    }
-    return {name: module for name, module in found.items() if hasattr(module, "ENV")}
-
-
-def _of(env: Env) -> ModuleType | None:
-    """The oracle of exactly this class of environments."""
-    found = (module for module in oracles().values() if type(env) is module.ENV)
-    return next(found, None)
+    states: Floats  # (n, d)
+    q: Floats  # (n, A)
 
 
 def has_oracle(env: Env) -> bool:
-    """Whether an oracle knows `env`."""
-    return _of(env) is not None
+    """Whether an oracle knows exactly this class of environments."""
+    return type(env) in {oracle.ENV for oracle in ORACLES.values()}
 
 
-@functools.lru_cache(maxsize=64)
+@lru_cache(maxsize=64)
 def reference(env: Env) -> Reference | None:
     """Q* of `env`; None without an oracle."""
-    oracle = _of(env)
-    return oracle.reference(env) if oracle else None
+    return Reference(*ORACLES[env.name].reference(env)) if has_oracle(env) else None

@@ -1,15 +1,11 @@
 """Q* of the maze: value iteration on its lattice."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from bcrl.envs.maze import Maze
-from bcrl.evaluation.oracle import Reference
 from bcrl.learning import Booleans, Floats, Integers
 from bcrl.learning.rollout import transition_tables
 
@@ -34,19 +30,8 @@ def optimal_q(
         q = new
 
 
-def lattice_q(env: Any) -> Floats:
-    """Q* (N, A) on all states of a finite environment."""
-    return optimal_q(*transition_tables(env), env.gamma)
-
-
-def start_value(env: Any) -> float:
-    """V*(s0) of the start state."""
-    start = env.initial(np.zeros(env.initial_noise))
-    return float(lattice_q(env)[env.index(start)].max())
-
-
-def reference(env: Maze) -> Reference:
-    """Q* where an agent can stand and has to act: neither wall nor goal.
+def reference(env: Maze) -> tuple[Floats, Floats]:
+    """The states (n, 2) where an agent has to act, neither wall nor goal, and Q* there.
 
     A preset whose positions leave the lattice is compared with the lattice's Q*, as the
     authors compare their floating-point maze with V*(s0) = −47.5576.
@@ -55,13 +40,11 @@ def reference(env: Maze) -> Reference:
         env = replace(env, preset="lattice")
     states = env.states()
     inside = ~(env.blocked(states) | env.is_goal(states))
-    return Reference(states[inside], lattice_q(env)[inside])
+    return states[inside], optimal_q(*transition_tables(env), env.gamma)[inside]
 
 
 def table(env: Maze) -> Iterator[str]:
     """CSV lines `x,y,action,q`, states outermost."""
     yield "x,y,action,q"
-    known = reference(env)
-    for (x, y), values in zip(known.states.tolist(), known.q.tolist(), strict=True):
-        for action, q in enumerate(values):
-            yield f"{x},{y},{action},{q}"
+    for (x, y), values in zip(*map(np.ndarray.tolist, reference(env)), strict=True):
+        yield from (f"{x},{y},{action},{q}" for action, q in enumerate(values))
