@@ -1,17 +1,15 @@
 """The command's flags, its help, and what Tab completes."""
 
-from __future__ import annotations
-
 import argparse
+import contextlib
 import os
 import sys
 import textwrap
 from argparse import Namespace
 from collections.abc import Sequence
 from itertools import takewhile
-from pathlib import Path
 from string import Template
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from hydra._internal.utils import get_args_parser
 from omegaconf import OmegaConf
@@ -19,18 +17,11 @@ from omegaconf import OmegaConf
 from bcrl import __version__
 from bcrl.common.files import user_folder
 from bcrl.common.identity import flat
-from bcrl.config.hydra_compose import (
-    CONFIG_NAME,
-    PACKAGE,
-    composed,
-    group_names,
-    options,
-)
+from bcrl.config import hydra_compose as compose
 from bcrl.config.safety import check_override
 from bcrl.errors import BcrlError, closest
 
-HELP = PACKAGE / "config" / "help.txt"
-WIDTH, HANGING = 88, 21  # columns of the help, and where an option's text begins
+HELP = compose.PACKAGE / "config" / "help.txt"
 #: Flags of which Hydra knows nothing, or that are handed to it in another way.
 _OURS = (
     *("describe", "dry_run", "status", "runs_dir", "overrides", "config_dir"),
@@ -45,17 +36,21 @@ def arguments() -> Namespace:
     `unnamed` says so.
     """
     flags, words = flag_parser(), sys.argv[1:]
-    for place, word in enumerate(takewhile(lambda word: word != "--", words)):
+    names = _names(flags)
+    for word in words:
         check_override(word)
-        if word.startswith("-") and not _is_flag(word, flags):
-            raise BcrlError(f"{word}: unknown flag; {_meant(words, place, flags)}")
+    for place, word in enumerate(takewhile(lambda word: word != "--", words)):
+        name = word.partition("=")[0]
+        letters = len(name) > 1 and all(f"-{letter}" in names for letter in name[1:])
+        is_long = name[:2] == "--" and any(each.startswith(name) for each in names)
+        if name[:1] == "-" and not (name in names or letters or is_long):
+            raise BcrlError(f"{word}: unknown flag; {_meant(words, place, names)}")
     asked = flags.parse_intermixed_args()
     if asked.runs_dir is not None:
         quoted = asked.runs_dir.replace('"', r"\"")
         asked.overrides.append(f'runs_dir="{quoted}"')
     asked.unnamed = asked.config_dir is None
-    folder = asked.config_dir or own_folder()
-    asked.config_dir = os.path.abspath(folder) if folder else None
+    asked.config_dir = _folder(asked)
     return asked
 
 
@@ -81,12 +76,12 @@ def flag_parser() -> argparse.ArgumentParser:
     result.add_argument("--dry-run", action="store_true", help="list jobs and costs")
     result.add_argument("--runs-dir", metavar="PATH", help="as runs_dir=PATH")
     result.add_argument("--status", action="store_true", help="list what is done")
-    result.error = _reject  # type: ignore[method-assign]
+
+    def reject(message: str) -> NoReturn:
+        raise BcrlError(f"{message}; see bcrl --help")
+
+    result.error = reject  # type: ignore[method-assign]
     return result
-
-
-def _reject(message: str) -> NoReturn:
-    raise BcrlError(f"{message}; see bcrl --help")
 
 
 def _names(flags: argparse.ArgumentParser) -> list[str]:
@@ -94,17 +89,7 @@ def _names(flags: argparse.ArgumentParser) -> list[str]:
     return [each for action in flags._actions for each in action.option_strings]
 
 
-def _is_flag(word: str, flags: argparse.ArgumentParser) -> bool:
-    """Whether a word is a flag, may be abbreviated and with its value."""
-    name, known = word.partition("=")[0], _names(flags)
-    if name.startswith("--"):
-        return any(each.startswith(name) for each in known)
-    return name in known or (
-        len(name) > 1 and all(f"-{letter}" in known for letter in name[1:])
-    )
-
-
-def _meant(words: Sequence[str], place: int, flags: argparse.ArgumentParser) -> str:
+def _meant(words: Sequence[str], place: int, names: Sequence[str]) -> str:
     """What an unknown flag probably means."""
     from bcrl.config.hints import Hints
 
@@ -114,17 +99,19 @@ def _meant(words: Sequence[str], place: int, flags: argparse.ArgumentParser) -> 
     if value and value.isdecimal():  # --seeds 0 1 2
         value = " ".join([value, *takewhile(str.isdecimal, follow)])
     chosen = tuple(each for each in words if "=" in each and not each.startswith("-"))
-    names = {name for name in _names(flags) if name[:2] == "--"}
-    names -= {"--runs-dir"}  # its key says as much
-    near = closest(word.partition("=")[0], names, 0.7)
-    line = near or Hints(chosen).line(word, value) or closest(word, names, 0.6)
+    # What --runs-dir says its key says, too.
+    long = [name for name in names if name[:2] == "--" and name != "--runs-dir"]
+    near = closest(word.partition("=")[0], long, 0.7)
+    line = near or Hints(chosen).line(word, value) or closest(word, long, 0.6)
     return f"did you mean {line}?" if line else "see bcrl --help"
 
 
-def own_folder() -> Path | None:
-    """The user's folder of configs, ~/.config/bcrl, if it is there."""
+def _folder(asked: Namespace) -> str | None:
+    """The folder of configs, absolute: the one that is named, or ~/.config/bcrl."""
     base = user_folder("XDG_CONFIG_HOME", ".config")
-    return base / "bcrl" if base and (base / "bcrl").is_dir() else None
+    own = base / "bcrl" if base and (base / "bcrl").is_dir() else None
+    folder = asked.config_dir or own
+    return os.path.abspath(folder) if folder else None
 
 
 def short() -> str:
@@ -138,14 +125,13 @@ def manual(config_dir: str | None) -> str:
     """The help, with the options of every group, those of the user's folder too."""
     folders = (config_dir,) if config_dir else ()
     text = Template(HELP.read_text("utf-8"))
+    groups = {name: name.replace("__", "/") for name in text.get_identifiers()}
     listed = {
-        name: ", ".join(options(name.replace("__", "/"), folders))
-        for name in text.get_identifiers()
+        name: ", ".join(compose.options(groups[name], folders)) for name in groups
     }
     lines = text.substitute(listed).splitlines()
-    hanging = " " * HANGING
-    wrapped = [textwrap.fill(x, WIDTH, subsequent_indent=hanging) for x in lines]
-    return "\n".join(wrapped)
+    hanging = " " * 21  # where an option's text begins
+    return "\n".join(textwrap.fill(x, 88, subsequent_indent=hanging) for x in lines)
 
 
 def completions(line: str) -> list[str]:
@@ -159,23 +145,25 @@ def completions(line: str) -> list[str]:
         typed, _ = flags.parse_known_intermixed_args(words)
     except BcrlError:  # a flag's own argument is missing: the shell proposes files
         return []
-    folder = typed.config_dir or own_folder()
-    folders = (os.path.abspath(folder),) if folder else ()
+    folder = _folder(typed)
+    folders = (folder,) if folder else ()
     key, equals, value = word.partition("=")
     if equals:
-        return [f"{key}={o}" for o in options(key, folders) if o.startswith(value)]
+        return [
+            f"{key}={o}" for o in compose.options(key, folders) if o.startswith(value)
+        ]
     chosen = any(o.startswith(("env=", "experiment=")) for o in typed.overrides)
     # Without an env nothing composes; most keys are the same in all of them.
     overrides = [o for o in typed.overrides if not o.startswith("hydra.")]
     asked = (*["env=maze"] * (not chosen), *overrides)
-    known = {
-        group: None for group in group_names(folders) if not group.startswith("tuned")
-    }
-    try:
-        job = OmegaConf.to_container(composed(CONFIG_NAME, asked, folders))
-        known |= {k: v for k, v in flat(job).items() if not k.startswith("hydra.")}  # type: ignore
-    except BcrlError:
-        pass  # the command itself says what is wrong
+    known = [
+        group for group in compose.group_names(folders) if not group.startswith("tuned")
+    ]
+    with contextlib.suppress(BcrlError):  # the command itself says what is wrong
+        job: Any = OmegaConf.to_container(
+            compose.composed(compose.CONFIG_NAME, asked, folders)
+        )
+        known += [key for key in flat(job) if not key.startswith("hydra.")]
     found = set()
     for each in known:
         if each.startswith(word):

@@ -4,14 +4,12 @@ The command line and `bcrl.api` both make their stages here, so what one of them
 or rejects, the other does, too.
 """
 
-from __future__ import annotations
-
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, cast
 
 from bcrl.common.checks import one_of
 from bcrl.config.variant import Composition
@@ -26,8 +24,9 @@ from bcrl.q.functions import ZERO
 from bcrl.q.quadratic import FEATURES
 
 _COUNTS = (
-    *("iterations", "episodes", "steps", "target_update", "batch_size"),
-    *("evaluate_every", "evaluation_episodes"),
+    *("iterations", "episodes", "steps", "target_update", "batch_size", "replay_size"),
+    *("evaluate_every", "evaluation_episodes", "lockstep", "workers", "threads"),
+    *("max_iterations", "max_episodes", "max_steps"),
 )
 _STEPS = ("random_steps", "learning_starts", "anneal_steps")
 _PROBABILITIES = ("epsilon", "epsilon_start", "evaluation_epsilon")
@@ -36,7 +35,10 @@ BOUNDS = {
     **dict.fromkeys(_COUNTS, (Integral, 1, math.inf)),
     **dict.fromkeys(_STEPS, (Integral, 0, math.inf)),
     **dict.fromkeys(_PROBABILITIES, (Real, 0, 1)),
+    **{"first": (Integral, 0, 2**32), "count": (Integral, 1, 10**6)},
 }
+#: What FQI knows of shaping: none, or the paper's.
+SHAPES = (None, Shape())
 #: Settings that a warm start passes on, so that they can't differ between slots.
 PASSED_ON = {FQI: ("regressor",), DQN: ("hidden", "learning_rate")}
 
@@ -51,12 +53,11 @@ def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...
     _check(chosen, learners)
     chosen.check()
     slots = list(zip(chosen.order, learners, strict=True))
-    last = learners[-1]
+    all_dqn = [learner for learner in learners if isinstance(learner, DQN)]
     warm = chosen.transfers == (warm_start,)
-    if warm and chosen.target_only and all(isinstance(x, DQN) for x in learners):
-        steps = sum(learner.steps for learner in learners if isinstance(learner, DQN))
-        whole: Any = replace(last, steps=steps)  # type: ignore[type-var]
-        slots = [(chosen.order[-1], whole)]
+    if warm and chosen.target_only and len(all_dqn) == len(learners):
+        steps = sum(learner.steps for learner in all_dqn)
+        slots = [(chosen.order[-1], replace(all_dqn[-1], steps=steps))]
     made: list[Stage] = []
     for number, (task, learner) in enumerate(slots, start=1):
         env = chosen.tasks[task]
@@ -103,7 +104,7 @@ def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
         elif isinstance(learner, DQN):
             _check_dqn(chosen, learner, start)
         elif isinstance(learner, LSPI):
-            _check_slot_of_lspi(chosen, slot, learner, start)
+            _check_slot(chosen, learner, slot, start)
     for one, other in pairwise(learners):
         for name in PASSED_ON.get(type(other), ()) if start.initial is not ZERO else ():
             here, there = getattr(one, name, None), getattr(other, name)
@@ -113,10 +114,9 @@ def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
 
 
 def _check_fqi(chosen: Composition, learner: FQI, env: Env, start: StageInit) -> None:
-    _check_numbers("algorithm", learner)
+    check_numbers("algorithm", vars(learner))
     regressor, why = learner.regressor, ""
-    key: str = "algorithm.regressor"
-    value: Any = regressor
+    key, value = "algorithm.regressor", cast(Any, regressor)
     if isinstance(regressor, type) or not hasattr(regressor, "fit"):
         why = "is no regressor"
     elif not hasattr(regressor, "finite_only"):
@@ -126,29 +126,23 @@ def _check_fqi(chosen: Composition, learner: FQI, env: Env, start: StageInit) ->
     elif learner.shared_data and learner.epsilon < 1:
         key, value = "algorithm.dataset", "shared"
         why = "seeds can share data only if all are random: algorithm.epsilon must be 1"
-    elif start.behavior is not None:
+    elif chosen.boost and start.boost != Boost():
+        key, value = "boosting", chosen.boost
+        why = "is the released DQN's; FQI learns with the paper's, boosting=on"
+    elif (start.behavior, start.boost) != (None, Boost()) or start.shape not in SHAPES:
         key, value = "transfer", chosen.transfer
-        why = "steers step by step, FQI learns from whole episodes; use algorithm=dqn"
-    elif start.boost != Boost():
-        key = "boosting" if chosen.boost else "transfer"
-        value = chosen.boost or chosen.transfer
-        why = "is the released DQN's reading; FQI knows the paper's, boosting=on"
-    elif start.shape not in (None, Shape()):
-        key, value = "transfer", chosen.transfer
-        why = "is the released DQN's reading; FQI knows transfer=shaping"
+        why = "is for algorithm=dqn; FQI learns with transfer=shaping, or without one"
     if why:
-        raise chosen.error(key, value, why)
+        raise ConfigError(key, value, why)
 
 
 def _check_dqn(chosen: Composition, learner: DQN, start: StageInit) -> None:
-    _check_numbers("algorithm", learner)
+    check_numbers("algorithm", vars(learner))
     size, widths, why = learner.replay_size, learner.hidden, ""
-    key: str = "algorithm.replay_size"
-    value: Any = size
-    if not isinstance(size, Integral) or size < learner.batch_size:
-        why = f"holds less than a batch, batch_size={learner.batch_size}"
-    elif size <= learner.learning_starts:
-        why = f"never holds more than learning_starts={learner.learning_starts}"
+    key, value = "algorithm.replay_size", cast(Any, size)
+    if size < learner.batch_size or size <= learner.learning_starts:
+        why = f"must hold a batch, batch_size={learner.batch_size}, and more than "
+        why += f"learning_starts={learner.learning_starts}"
     elif not 0 < learner.learning_rate < math.inf:
         key, value = "algorithm.learning_rate", learner.learning_rate
         why = "must be a number above 0"
@@ -160,12 +154,10 @@ def _check_dqn(chosen: Composition, learner: DQN, start: StageInit) -> None:
         why = "sets `initial`, but DQN starts from networks: set `base`, `potential` "
         why += "or `prior`"
     if why:
-        raise chosen.error(key, value, why)
+        raise ConfigError(key, value, why)
 
 
-def _check_slot_of_lspi(
-    chosen: Composition, slot: int, learner: LSPI, start: StageInit
-) -> None:
+def _check_slot(chosen: Composition, lspi: LSPI, slot: int, start: StageInit) -> None:
     env = chosen.slots[slot]
     if getattr(env, "linear_quadratic", None) is None or not hasattr(env, "push"):
         why = "learns quadratic Q-functions of continuous actions, but "
@@ -176,30 +168,32 @@ def _check_slot_of_lspi(
         why = f"starts from nothing, so slot {slot + 1} would drop what the one before "
         why += "has learned: LSPI in the first slot, DQN in the others"
     else:
-        check_lspi(learner)
-        learner.episodes_per_iteration(env)  # says whether they are whole
+        check_lspi(lspi)
+        lspi.episodes_per_iteration(env)  # says whether they are whole
         return
-    raise ConfigError("algorithm.learners", learner.name, why)
+    raise ConfigError("algorithm.learners", lspi.name, why)
 
 
 def check_lspi(learner: LSPI) -> None:
     """Raise ConfigError for settings of LSPI's out of bounds."""
-    _check_numbers("algorithm.lspi", learner)
+    check_numbers("algorithm.lspi", vars(learner))
     one_of("algorithm.lspi.features", learner.features, FEATURES)
     if not 0 < learner.noise_std < math.inf:
         why = "must be above 0: without noise LSTDQ sees one action per state"
         raise ConfigError("algorithm.lspi.noise_std", learner.noise_std, why)
 
 
-def _check_numbers(section: str, learner: FQI | DQN | LSPI) -> None:
+def check_numbers(section: str, values: Mapping[str, Any]) -> None:
+    """Raise ConfigError for a setting out of its bounds."""
     for name, (kind, least, most) in BOUNDS.items():
-        value: Any = getattr(learner, name, least)
+        value = values.get(name, least)
         fits = isinstance(value, kind) and not isinstance(value, bool)
         if not fits or not least <= value <= most:
             noun = "an integer" if kind is Integral else "a number"
-            upper = f"from {least} to {most}"
-            bounds = upper if most < math.inf else f"of at least {least}"
-            raise ConfigError(f"{section}.{name}", value, f"must be {noun} {bounds}")
+            bounds = f"from {least} to {most}"
+            bounds = bounds if most < math.inf else f"of at least {least}"
+            key = f"{section}.{name}".lstrip(".")
+            raise ConfigError(key, value, f"must be {noun} {bounds}")
 
 
 def _with_data(learner: FQI, env: Env, before: Sequence[Stage]) -> FQI:
@@ -215,15 +209,11 @@ def _with_data(learner: FQI, env: Env, before: Sequence[Stage]) -> FQI:
 
 def _knows_a_policy(start: StageInit | None) -> bool:
     """Whether a stage has a policy from the start: shaping alone gives none."""
-    return start is None or any(
-        q is not ZERO for q in (start.base, start.initial, start.prior)
-    )
+    known = (start.base, start.initial, start.prior) if start else ()
+    return start is None or any(q is not ZERO for q in known)
 
 
 def _placed(stages: Sequence[Stage]) -> tuple[Stage, ...]:
     """Stages whose `before` counts what the ones before them take."""
-    done, out = 0, []
-    for stage in stages:
-        out.append(replace(stage, before=done))
-        done += stage.learner.length
-    return tuple(out)
+    lengths = accumulate((stage.learner.length for stage in stages), initial=0)
+    return tuple(replace(s, before=n) for s, n in zip(stages, lengths, strict=False))

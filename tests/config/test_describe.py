@@ -8,8 +8,7 @@ from omegaconf import OmegaConf
 
 from bcrl.common.identity import flat
 from bcrl.config import describe
-from bcrl.config.command import options
-from bcrl.config.hydra_compose import CONF, composed
+from bcrl.config.hydra_compose import CONF, composed, options
 from bcrl.errors import BcrlError
 
 ENTRIES = describe.entries()

@@ -316,10 +316,8 @@ def test_globs_choose_options():
     "typed", ["variant=B boosting=off", "variant=plain curriculum=on"]
 )
 def test_a_variant_and_a_group_that_contradict_it_are_rejected(typed):
-    with pytest.raises(BcrlError, match=f"variant=.*{typed.split()[1]}") as error:
+    with pytest.raises(BcrlError, match=f"variant=.*{typed.split()[1]}"):
         plan(*DQN.split(), *typed.split())
-    line = str(error.value).rpartition(", or ")[2].rstrip("?")
-    assert plan(*DQN.split(), *line.split()) and typed.split()[1] in line
     assert plan(MAZE, "variant=BC", "boosting=on", "seeds=1").name == "BC-FQI"
 
 

@@ -68,7 +68,7 @@ def outcome(make, *arguments, **options):
 
 def by_command(config: dict):
     """What the command line makes of a composed config."""
-    return compose.plan(config, {None: config}, "env").stages
+    return compose.plan(config, "env").stages
 
 
 def by_api(config: dict):
@@ -161,7 +161,7 @@ def test_an_order_of_ones_own_is_the_same_in_both(algorithm, monkeypatch):
         config = settled("car_on_hill", algorithm) | chosen
         assert outcome(by_command, config) == outcome(by_api, config)
         if len(order) == 3:
-            made = compose.plan(config, {None: config}, "car_on_hill")
+            made = compose.plan(config, "car_on_hill")
             named = "C-" in made.variant or "SC" in made.variant
             assert named == (len(set(order)) > 1)
 

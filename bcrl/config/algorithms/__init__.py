@@ -1,7 +1,5 @@
 """Algorithms: from a YAML of the group `algorithm` to the stages of a run."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from collections.abc import Collection
