@@ -77,10 +77,7 @@ def option_comments(group: str) -> dict[str, str]:
 
 
 def describe(word: str) -> str:
-    """What a key does, or a list: a group's options, the keys below, all keys for "".
-
-    Raises BcrlError for an unknown key.
-    """
+    """What a key does, or what a group or section has; "": a list of all keys."""
     key, known = word.partition("=")[0], entries()
     if chosen := [entry for entry in known if entry.key == key]:
         return "\n".join([key, *(_block(entry, len(chosen) > 1) for entry in chosen)])

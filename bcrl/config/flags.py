@@ -3,11 +3,12 @@
 import argparse
 import contextlib
 import os
+import re
 import sys
 import textwrap
 from argparse import Namespace
-from collections.abc import Sequence
 from itertools import takewhile
+from pathlib import Path
 from string import Template
 from typing import Any, NoReturn
 
@@ -17,24 +18,17 @@ from omegaconf import OmegaConf
 from bcrl import __version__
 from bcrl.common.files import user_folder
 from bcrl.common.identity import flat
-from bcrl.config import hydra_compose as compose
+from bcrl.config.hydra_compose import composed, group_names, options
 from bcrl.config.safety import check_override
 from bcrl.errors import BcrlError, closest
 
-HELP = compose.PACKAGE / "config" / "help.txt"
+HELP = Path(__file__).with_name("help.txt")
 #: Flags of which Hydra knows nothing, or that are handed to it in another way.
-_OURS = (
-    *("describe", "dry_run", "status", "runs_dir", "overrides", "config_dir"),
-    *("help", "version"),
-)
+_OURS = {"describe", "dry_run", "status", "runs_dir", "overrides", "config_dir"}
 
 
 def arguments() -> Namespace:
-    """What the command line asks for; BcrlError for an unknown flag.
-
-    If no folder of configs is named, it is ~/.config/bcrl where that exists;
-    `unnamed` says so.
-    """
+    """What the command line asks for; `unnamed`: it names no folder of configs."""
     flags, words = flag_parser(), sys.argv[1:]
     names = _names(flags)
     for word in words:
@@ -44,7 +38,14 @@ def arguments() -> Namespace:
         letters = len(name) > 1 and all(f"-{letter}" in names for letter in name[1:])
         is_long = name[:2] == "--" and any(each.startswith(name) for each in names)
         if name[:1] == "-" and not (name in names or letters or is_long):
-            raise BcrlError(f"{word}: unknown flag; {_meant(words, place, names)}")
+            from bcrl.config.hints import Hints  # a large import
+
+            chosen = tuple(each for each in words if re.match(r"[^-].*=", each))
+            # What --runs-dir says its key says, too.
+            near = closest(name, set(names) - {"--runs-dir"}, 0.7)
+            meant = "" if near else Hints(chosen).meant(words, place)
+            meant = meant or f"did you mean {near}?"
+            raise BcrlError(f"{word}: unknown flag; {meant}")
     asked = flags.parse_intermixed_args()
     if asked.runs_dir is not None:
         quoted = asked.runs_dir.replace('"', r"\"")
@@ -59,7 +60,7 @@ def for_hydra(asked: Namespace) -> list[str]:
     given = []
     for action in flag_parser()._actions:
         value = getattr(asked, action.dest, None)
-        if value and action.dest not in _OURS:
+        if value and action.dest not in {*_OURS, "help", "version"}:
             short, long = (f(action.option_strings, key=len) for f in (min, max))
             given.append(short if value is True else f"{long}={value}")
     return given
@@ -89,23 +90,6 @@ def _names(flags: argparse.ArgumentParser) -> list[str]:
     return [each for action in flags._actions for each in action.option_strings]
 
 
-def _meant(words: Sequence[str], place: int, names: Sequence[str]) -> str:
-    """What an unknown flag probably means."""
-    from bcrl.config.hints import Hints
-
-    word = words[place]
-    follow = takewhile(lambda w: "=" not in w and w[:1] != "-", words[place + 1 :])
-    value = next(follow, None)
-    if value and value.isdecimal():  # --seeds 0 1 2
-        value = " ".join([value, *takewhile(str.isdecimal, follow)])
-    chosen = tuple(each for each in words if "=" in each and not each.startswith("-"))
-    # What --runs-dir says its key says, too.
-    long = [name for name in names if name[:2] == "--" and name != "--runs-dir"]
-    near = closest(word.partition("=")[0], long, 0.7)
-    line = near or Hints(chosen).line(word, value) or closest(word, long, 0.6)
-    return f"did you mean {line}?" if line else "see bcrl --help"
-
-
 def _folder(asked: Namespace) -> str | None:
     """The folder of configs, absolute: the one that is named, or ~/.config/bcrl."""
     base = user_folder("XDG_CONFIG_HOME", ".config")
@@ -125,11 +109,9 @@ def manual(config_dir: str | None) -> str:
     """The help, with the options of every group, those of the user's folder too."""
     folders = (config_dir,) if config_dir else ()
     text = Template(HELP.read_text("utf-8"))
-    groups = {name: name.replace("__", "/") for name in text.get_identifiers()}
-    listed = {
-        name: ", ".join(compose.options(groups[name], folders)) for name in groups
-    }
-    lines = text.substitute(listed).splitlines()
+    names = text.get_identifiers()
+    known = {name: options(name.replace("__", "/"), folders) for name in names}
+    lines = text.substitute({n: ", ".join(known[n]) for n in known}).splitlines()
     hanging = " " * 21  # where an option's text begins
     return "\n".join(textwrap.fill(x, 88, subsequent_indent=hanging) for x in lines)
 
@@ -147,26 +129,17 @@ def completions(line: str) -> list[str]:
         return []
     folder = _folder(typed)
     folders = (folder,) if folder else ()
-    key, equals, value = word.partition("=")
+    key, equals, _ = word.partition("=")
     if equals:
-        return [
-            f"{key}={o}" for o in compose.options(key, folders) if o.startswith(value)
-        ]
+        found = [f"{key}={option}" for option in options(key, folders)]
+        return [each for each in found if each.startswith(word)]
     chosen = any(o.startswith(("env=", "experiment=")) for o in typed.overrides)
     # Without an env nothing composes; most keys are the same in all of them.
     overrides = [o for o in typed.overrides if not o.startswith("hydra.")]
     asked = (*["env=maze"] * (not chosen), *overrides)
-    known = [
-        group for group in compose.group_names(folders) if not group.startswith("tuned")
-    ]
+    known = [name for name in group_names(folders) if not name.startswith("tuned")]
     with contextlib.suppress(BcrlError):  # the command itself says what is wrong
-        job: Any = OmegaConf.to_container(
-            compose.composed(compose.CONFIG_NAME, asked, folders)
-        )
+        job: Any = OmegaConf.to_container(composed(asked, folders))
         known += [key for key in flat(job) if not key.startswith("hydra.")]
-    found = set()
-    for each in known:
-        if each.startswith(word):
-            step, dot, _ = each[len(word) :].partition(".")
-            found.add(f"{word}{step}{dot or '='}")
-    return sorted(found)
+    rest = (name[len(word) :].partition(".") for name in known if name.startswith(word))
+    return sorted({f"{word}{step}{dot or '='}" for step, dot, _ in rest})

@@ -6,17 +6,12 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 import yaml
-from hydra.core.override_parser.types import (
-    ChoiceSweep,
-    Glob,
-    Override,
-    RangeSweep,
-    Sweep,
-)
+from hydra.core.override_parser.types import Glob, Override, RangeSweep, Sweep
 from omegaconf import OmegaConf
 
 from bcrl.common.identity import Plain, flat
@@ -26,11 +21,9 @@ from bcrl.config.schema import Config
 from bcrl.errors import BcrlError, closest
 
 #: Groups that Hydra would take any option of, known or not.
-OPTIONAL = ("budget", "local")
+OPTIONAL = ("budget", "tuned", "local")
 #: The groups whose options have keys.
-_SECTIONS = (
-    *("env", "algorithm", "algorithm/regressor", "boosting", "transfer", "logger"),
-)
+_SECTIONS = ("env", "algorithm", "algorithm/regressor", "boosting", "transfer")
 
 
 def _by_word(table: Mapping[str, str]) -> dict[str, str]:
@@ -63,10 +56,9 @@ class Hints:
         chosen = [o for o in self.overrides if o.partition("=")[0] in self.groups]
         for asked in (tuple(chosen), ("env=maze", *chosen), ("env=maze",)):
             with contextlib.suppress(BcrlError):
-                job = compose.composed(compose.CONFIG_NAME, asked, self.folders)
+                job = compose.composed(asked, self.folders)
                 values: Any = OmegaConf.to_container(job)
-                del values["hydra"]
-                return flat(values)
+                return flat({key: values[key] for key in values if key != "hydra"})
         return {}
 
     @cached_property
@@ -83,17 +75,16 @@ class Hints:
     @cached_property
     def spellings(self) -> dict[str, str]:
         """Groups and keys by what they may be called: parts left out, or a plural."""
-        known = [*self.groups, "seed", "seeds", *self.present, *self.brought]
-        found: dict[str, str] = {}
-        for name in known:
-            found.setdefault(name.lower().replace("/", "."), name)
-        others = {w: found[ours] for w, ours in _KEYS.items() if ours in found}
-        for name in known:
-            parts = re.split("[./]", name.lower())
+        whole: dict[str, str] = {}
+        for name in (*self.groups, "seed", "seeds", *self.present, *self.brought):
+            whole.setdefault(name.lower().replace("/", "."), name)
+        found = dict(whole)
+        for spelled, name in whole.items():
+            parts = spelled.split(".")
             for form in (parts[-1], f"{parts[0]}.{parts[-1]}", ".".join(parts[-2:])):
-                for spelled in (form, form.removesuffix("s"), f"{form}s"):
-                    found.setdefault(spelled, name)
-        return found | others
+                for each in (form, form.removesuffix("s"), f"{form}s"):
+                    found.setdefault(each, name)
+        return found | {w: whole[ours] for w, ours in _KEYS.items() if ours in whole}
 
     def line(self, typed: str, value: str | None = None) -> str | None:
         """What to type for a key or a whole word, which may have its value."""
@@ -120,8 +111,6 @@ class Hints:
 
     def _with(self, key: str, value: str) -> str:
         """The key with its value, and before it the option that brings the key."""
-        if key in ("env", "env.id") and (ours := gymnasium(value)):
-            return ours
         if key in self.groups:
             return self._choice(key, value) or f"{key}={value or '…'}"
         if key in ("seeds", "seed"):
@@ -134,6 +123,8 @@ class Hints:
 
     def _choice(self, group: str, value: object) -> str | None:
         """`env=maze`, the option of a group that a value means, if there is one."""
+        if ours := gymnasium(f"{group}/{value}".removeprefix("env/")):
+            return ours
         known = {name.lower(): name for name in self.groups.get(group, ())}
         typed = str(value).strip("'\"[] ").lower().replace("-", "_")
         text = typed.removesuffix("_fqi").removesuffix("_dqn")
@@ -149,39 +140,27 @@ class Hints:
     def check(self) -> None:
         """Raise BcrlError for a word that isn't KEY=VALUE, or another tool's value."""
         for place, word in enumerate(self.overrides):
-            spaced = re.match(r"\s*([\w./]+)\s+=\s*(.*)$", word)
-            if not spaced and ("=" in word.strip("=") or word.startswith("~")):
-                continue
-            follow = (w for w in self.overrides[place + 1 : place + 3] if w != "=")
-            after = next(follow, "-")
-            value = None if "=" in after or after.startswith("-") else after
-            meant = (
-                self.mean(spaced[1], spaced[2]) if spaced else self.mean(word, value)
-            )
-            raise BcrlError(f"{word!r} can't be read as KEY=VALUE; {meant}")
-        parsed = parse(self.overrides)
-        hydras = [o.get_key_element() for o in parsed if o.key_or_group[:5] == "hydra"]
-        for override in parsed:
-            if why := self._wrong(override, hydras):
+            alone = "=" not in word.strip("=") and word[:1] != "~"
+            if alone or re.match(r"\s*[\w./]+\s+=", word):
+                meant = self.meant(self.overrides, place)
+                raise BcrlError(f"{word!r} can't be read as KEY=VALUE; {meant}")
+        for override in parse(self.overrides):
+            if why := self._wrong(override):
                 raise BcrlError(f"{override.input_line}: {why}")
 
-    def _wrong(self, override: Override, hydras: Sequence[str]) -> str | None:
+    def _wrong(self, override: Override) -> str | None:
         """Why not to type what Hydra would take without a word, or trip over."""
         key, value = override.key_or_group, override.value()
         raw = str(override.input_line).partition("=")[2]
         group, is_text = key.replace(".", "/"), isinstance(value, str)
-        if hydras.count(override.get_key_element()) > 1:
-            return "given twice; Hydra would merge the values"
         if override.is_delete() and key in Config.__annotations__:
             return "can't be deleted: every run needs a choice of it, or its default"
-        if key == "tuned":
-            return "follows from the other choices; override its keys"
         if key in self.groups and not isinstance(value, str | Sweep | Glob | None):
             return f"name one option; {self.of_option(key, value)}"
-        if key in OPTIONAL and isinstance(value, str | ChoiceSweep):
-            swept = not isinstance(value, str)
+        if key in OPTIONAL and isinstance(value, str | Sweep):
+            swept = isinstance(value, Sweep)
             for name in override.sweep_string_iterator() if swept else [value]:
-                if name not in self.groups[key]:
+                if name not in self.groups.get(key, ()):
                     return f"there is no {name}; {self.of_option(key, name)}"
         seeds = key in ("seed", "seeds") and (is_text or isinstance(value, RangeSweep))
         habits = {} if key in self.groups else _VALUES.get(key, {})
@@ -189,6 +168,17 @@ class Hints:
         if (seeds and raw[:2] != "${") or str(value).lower() in habits or dotted:
             return f"did you mean {self._with(group if dotted else key, raw)}?"
         return None
+
+    def meant(self, words: Sequence[str], place: int) -> str:
+        """What a word that is neither KEY=VALUE nor a flag means; words may follow."""
+        if spaced := re.match(r"\s*([\w./]+)\s+=\s*(.*)$", words[place]):
+            return self.mean(spaced[1], spaced[2])
+        rest = (word for word in words[place + 1 :] if word != "=")
+        follow = takewhile(lambda word: "=" not in word and word[:1] != "-", rest)
+        value = next(follow, None)
+        if value and value.isdecimal():  # --seeds 0 1 2
+            value = " ".join([value, *takewhile(str.isdecimal, follow)])
+        return self.mean(words[place], value)
 
     def swept(self) -> str:
         """What to say of several values without -m."""
@@ -204,7 +194,7 @@ class Hints:
         key = error.key
         if error.option is not None:
             return f"{key}={error.option}: {self.of_option(key, error.option)}"
-        if compose.NO_ENV in str(error):  # perhaps it has another's name
+        if not key:  # perhaps it has another's name
             ours = {*self.groups, "seed", "seeds", *self.present}
             for key, _, value in (o.partition("=") for o in self.overrides):
                 if key not in ours and not key.startswith(("+", "~", "hydra")):
@@ -236,8 +226,7 @@ class Hints:
 
     def of_option(self, group: str, value: object) -> str:
         """`did you mean env=maze?`, and the options."""
-        near = gymnasium(f"{group}/{value}".removeprefix("env/"))
-        near, known = near or self._choice(group, value), self.groups.get(group)
+        near, known = self._choice(group, value), self.groups.get(group)
         listed = f"known: {', '.join(known)}" if known else "see bcrl --help"
         return f"did you mean {near}? ({listed})" if near else listed
 

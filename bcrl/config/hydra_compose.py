@@ -32,12 +32,11 @@ UNKNOWN = re.compile(
     r"|Multiple values for ([^.\s]+)\."
     r"|In '[^']*': ConfigKeyError .* Key '([^']+)' not in 'Config'"
 )
-NO_ENV = "You must specify 'env'"
 Paths = tuple[str, ...]  # of folders of configs, besides our own
 
 
 class Unknown(BcrlError):
-    """An unknown key, or an unknown option of a group."""
+    """An unknown key, or an unknown option of a group; "": the env is missing."""
 
     def __init__(self, text: str, key: str, option: str | None = None) -> None:
         super().__init__(text)
@@ -66,7 +65,9 @@ def searchpath(folders: Paths) -> list[str]:
 
 
 @cache
-def composed(name: str, overrides: tuple[str, ...], folders: Paths) -> DictConfig:
+def composed(
+    overrides: tuple[str, ...], folders: Paths = (), name: str = CONFIG_NAME
+) -> DictConfig:
     """One job's config, composed from its overrides; BcrlError says what is wrong."""
     register_plugins()
     try:
@@ -91,8 +92,8 @@ def composed(name: str, overrides: tuple[str, ...], folders: Paths) -> DictConfi
     if unknown := UNKNOWN.match(message):
         key = next(filter(None, unknown.groups()))
         raise Unknown(message if message[:3] == "In " else f"{key}: unknown key", key)
-    if message.startswith(NO_ENV):
-        raise Unknown(message, "env")
+    if message.startswith("You must specify 'env'"):
+        raise Unknown(message, "")
     raise BcrlError(message)
 
 

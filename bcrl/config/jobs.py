@@ -33,8 +33,7 @@ OPEN = "gymnasium"
 def plans(arguments: Namespace) -> list[Plan]:
     """The checked plan of each job that this command line asks for.
 
-    The arguments' overrides are canonical afterwards, their folders absolute. Raises
-    BcrlError for what can't be read, composed or learned.
+    The arguments' overrides are canonical afterwards, their folders absolute.
     """
     overrides = list(arguments.overrides)
     folders = _folders(arguments)
@@ -45,20 +44,20 @@ def plans(arguments: Namespace) -> list[Plan]:
     multirun = bool(arguments.multirun)
     if multirun and getattr(arguments, "cfg", None):
         raise BcrlError("--cfg shows one composition; drop -m and the sweep")
-    # Each experiment is a sweep of its own.
-    swept = [o for o in parsed if o.is_sweep_override()]
-    swept = [o for o in swept if o.key_or_group == "experiment"]
+    swept = {o.key_or_group for o in parsed if o.is_sweep_override()}
     if swept and not multirun:
         raise BcrlError(hints.swept())
-    rest = [o for o in parsed if o not in swept]
     name = arguments.config_name or CONFIG_NAME
     set_by_user = folders or any(o.key_or_group.startswith("hydra") for o in parsed)
     found = []
     try:
-        usual = composed(CONFIG_NAME, ("env=maze",), ()) if set_by_user else None
-        for one in product(swept):
-            for words in _jobs(name, parse(one) + rest, hints, multirun):
-                job = composed(name, tuple(words), folders)
+        usual = composed(("env=maze",)) if set_by_user else None
+        for typed in product(parsed):
+            hydra = composed(tuple(typed), folders, name).hydra
+            both = multirun or hydra.mode == RunMode.MULTIRUN
+            params = _params(hydra, folders) if both else []
+            for words in product(params + parse(typed)):
+                job = composed(tuple(words), folders, name)
                 safety.check_composed(job, usual)
                 launcher = job.hydra.launcher
                 schema.check_launcher(launcher and hydra_compose.plain(launcher))
@@ -68,7 +67,7 @@ def plans(arguments: Namespace) -> list[Plan]:
     if any(_launched(job.hydra) for job in found):
         if not multirun and found[0].hydra.mode != RunMode.MULTIRUN:
             raise BcrlError("hydra/launcher: a sweep's jobs are launched; add -m")
-        if swept:
+        if "experiment" in swept:
             raise BcrlError("experiment: with hydra/launcher, one at a time")
     # What a folder says is the user's own, unless nobody named the folder.
     own = not getattr(arguments, "unnamed", False) and bool(folders)
@@ -83,10 +82,7 @@ def plans(arguments: Namespace) -> list[Plan]:
 
 
 def plan_of_job(config: DictConfig, hydra: DictConfig) -> Plan:
-    """The plan of a job that a launcher runs, given Hydra's part of its config.
-
-    The command that launched it has checked the config.
-    """
+    """The plan of a job that a launcher runs; the command has checked its config."""
     hydra_compose.register_plugins()
     scheme = safety.ConfigFolder.scheme()
     folders = [s.path for s in hydra.runtime.config_sources if s.schema == scheme]
@@ -114,38 +110,27 @@ def _folders(arguments: Namespace) -> Paths:
     return arguments.folders
 
 
-def _jobs(
-    name: str, overrides: list[Override], hints: Hints, multirun: bool
-) -> list[list[str]]:
-    """Each job's overrides: the product of what the command line and config sweep."""
-    jobs = product(overrides)
-    first = composed(name, tuple(jobs[0]), hints.folders).hydra
-    if not multirun and first.mode != RunMode.MULTIRUN:
-        if any(o.is_sweep_override() for o in overrides):
-            raise BcrlError(hints.swept())
-        return jobs
-    swept = first.sweeper.get("params") or {}
+def _params(hydra: DictConfig, folders: Paths) -> list[Override]:
+    """What a config sweeps over, an experiment's for one."""
+    swept = hydra.sweeper.get("params") or {}
     for key in map(str, swept):
         if key.lstrip("+~").startswith("hydra"):
             why = "a config can't sweep over Hydra's own keys"
             raise ConfigError(f"hydra.sweeper.params.{key}", swept[key], why)
     params = [f"{key}={value}" for key, value in swept.items()]
-    meant = canonical(params, hints.folders)
+    meant = canonical(params, folders)
     if meant != params:  # Hydra takes them as they are written
         parts = (each.partition("=") for each in meant)
         written = ", ".join(f"{key}: '{value}'" for key, _, value in parts)
         why = f"write {{{written}}} instead of {{{', '.join(params)}}}"
         raise BcrlError(f"hydra.sweeper.params: {why}")
-    return product(parse(params) + overrides)
+    return parse(params)
 
 
 def _plan(
     job: DictConfig, hydra: DictConfig, folders: Paths, typed: Sequence[str] | None
 ) -> Plan:
-    """The plan of one composed config, given Hydra's part of it.
-
-    `typed`: the overrides in which code may be named; None: all of the config may.
-    """
+    """A config's plan; `typed` may name code, and all of the config if it is None."""
     choices = hydra.runtime.choices
     for group in VARIANT_GROUPS:
         if choices.get(group) is None:
@@ -170,7 +155,9 @@ def _plan(
         env = str(config["env"]["id"]).rpartition(":")[2].replace("/", "-")
     tag, command = _tag(config, hydra, folders), _command(hydra, folders)
     try:
-        return planning.plan(config, env, tag, command, _launched(hydra))
+        return planning.plan(
+            config, env, tag, command=command, launched=_launched(hydra)
+        )
     except ConfigError as error:
         option = choices.get(error.key.replace(".", "/"))  # as it was typed
         if option is None or error.key == "env":
@@ -218,16 +205,17 @@ def _tag(config: Plain, hydra: DictConfig, folders: Paths) -> str | None:
             name = RELEASED_OPTIONS.get(f"{group}={name}", name)
         shipped = (CONF / group / f"{name}.yaml").exists()
         usual[tag][group] = name if shipped else choices[group]
-    chosen = {group: choices[group] for group in VARIANT_GROUPS[1:]}
-    if chosen in usual.values() and not folders and _only_chooses(hydra):
-        return next(tag for tag in usual if usual[tag] == chosen)
+    if not folders and _only_chooses(hydra):
+        for tag, named in usual.items():
+            if named.items() <= dict(choices).items():
+                return tag
     changes = []
     for tag, named in usual.items():
         words = [f"{group}={option}" for group, option in named.items()]
         if choices["env"] == OPEN:
             words.append(f"env.id='{config['env']['id']}'")
         asked = (f"env={choices['env']}", "local=none", *words)
-        other = _plain(composed(CONFIG_NAME, asked, folders))
+        other = _plain(composed(asked, folders))
         changed = differences(config, other)
         if not changed:
             return tag
@@ -237,10 +225,7 @@ def _tag(config: Plain, hydra: DictConfig, folders: Paths) -> str | None:
 
 
 def _only_chooses(hydra: DictConfig) -> bool:
-    """Whether a job has nothing overridden that counts, so that none need be composed.
-
-    Composing takes a tenth of a second.
-    """
+    """Whether a job overrides no number: no need to compose, which takes 0.1 s."""
     experiment = read_option("experiment", hydra.runtime.choices.get("experiment"))
     entries = experiment.get("defaults") or ()
     keys = [o.lstrip("+").partition("=")[0] for o in hydra.overrides.task]

@@ -51,10 +51,7 @@ def parse(overrides: Sequence[str]) -> list[Override]:
 
 
 def canonical(overrides: Sequence[str], folders: Paths) -> list[str]:
-    """The overrides as Hydra should read them; BcrlError for what can't be read.
-
-    What is canonical stays as it is.
-    """
+    """The overrides as Hydra should read them; what is canonical stays as it is."""
     found: dict[str, str] = {}  # of a key of seeds the last one holds
     for each in _without_local(overrides):
         for text in _canonical(each, folders):
@@ -126,10 +123,7 @@ def _as_text(raw: str, is_folder: bool = False) -> str:
 
 
 def product(overrides: Sequence[Override]) -> list[list[str]]:
-    """The overrides of each job: every combination of the swept values.
-
-    Raises BcrlError for a sweep over more jobs than anyone can mean.
-    """
+    """The overrides of each job: every combination of the swept values."""
     jobs = 1.0
     for override in overrides:
         sweep = override.value()

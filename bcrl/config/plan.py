@@ -1,9 +1,9 @@
 """From a composed configuration to a plan: stages, transfers, variant, directory."""
 
-import math
 import re
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from bcrl.common import compiling, plugins
 from bcrl.common.checks import construct, one_of
@@ -67,17 +67,8 @@ class Plan:
         return sum(stage.learner.length for stage in self.stages)
 
 
-def plan(
-    config: Plain,
-    env: str,
-    tag: str | None = None,
-    command: str = "",
-    launched: bool = False,
-) -> Plan:
-    """The checked plan of a resolved config; ConfigError says what can't be.
-
-    `env` and `tag` name the directory of its results.
-    """
+def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
+    """The checked plan of a resolved config; `env` and `tag` name its directory."""
     compiling.check()
     _check_outputs(config, tag)
     check_name("env", env)
@@ -87,7 +78,6 @@ def plan(
     chosen_algorithm = algorithm(name)
     chosen = composition(config, tasks)
     stages = chosen_algorithm.stages(section, chosen)
-    chosen.check()  # an algorithm of the user's may have left it out
     asked = _asked(config["seeds"])
     return Plan(
         env=env,
@@ -103,8 +93,7 @@ def plan(
         device=_device(config["device"], chosen_algorithm.FAMILY),
         config=config,
         sources=plugins.fingerprint(config),
-        command=command,
-        launched=launched,
+        **more,
     )
 
 
@@ -113,9 +102,9 @@ def _asked(section: Plain) -> tuple[int, ...]:
     listed = section.get("only")
     if section.get("count") is not None:
         return tuple(range(section["first"], section["first"] + section["count"]))
-    if not listed or len(set(listed)) < len(listed):
+    if not listed or len(set(listed)) < len(listed) or min(listed) < 0:
         raise ConfigError("seeds.only", listed, "must be different seeds: seeds=[3,7]")
-    if not (min(listed) >= 0 and max(listed) <= 2**32 and len(listed) <= 10**6):
+    if max(listed) > 2**32 or len(listed) > 10**6:
         raise ConfigError("seeds.only", listed, "must be from 0 to 2^32, at most 10^6")
     return tuple(sorted(listed))
 
@@ -171,9 +160,6 @@ def _check_outputs(config: Plain, tag: str | None) -> None:
     for section in ("seeds", "scale", ""):
         values = config[section] if section else config
         check_numbers(section, {k: v for k, v in values.items() if v is not None})
-    if not 0 < config["checkpoint_every"] < math.inf:
-        why = "must be a number of seconds above 0"
-        raise ConfigError("checkpoint_every", config["checkpoint_every"], why)
     logger(config["logger"])
     one_of("progress", config["progress"], ["auto", "bar", "lines", "none"])
     check_path("runs_dir", config["runs_dir"])

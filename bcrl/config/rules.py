@@ -30,11 +30,14 @@ _COUNTS = (
 )
 _STEPS = ("random_steps", "learning_starts", "anneal_steps")
 _PROBABILITIES = ("epsilon", "epsilon_start", "evaluation_epsilon")
+_POSITIVE = ("learning_rate", "noise_std", "checkpoint_every")
+ABOVE_0 = math.nextafter(0.0, 1.0)
 #: A setting's type, its least and its greatest value.
 BOUNDS = {
     **dict.fromkeys(_COUNTS, (Integral, 1, math.inf)),
     **dict.fromkeys(_STEPS, (Integral, 0, math.inf)),
     **dict.fromkeys(_PROBABILITIES, (Real, 0, 1)),
+    **dict.fromkeys(_POSITIVE, (Real, ABOVE_0, math.inf)),
     **{"first": (Integral, 0, 2**32), "count": (Integral, 1, 10**6)},
 }
 #: What FQI knows of shaping: none, or the paper's.
@@ -50,21 +53,23 @@ def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...
     other settings of the last: its networks, task and replay stay the same. Raises
     ConfigError for what can't be learned, or would have no effect.
     """
-    _check(chosen, learners)
     chosen.check()
+    _check(chosen, learners)
     slots = list(zip(chosen.order, learners, strict=True))
     all_dqn = [learner for learner in learners if isinstance(learner, DQN)]
     warm = chosen.transfers == (warm_start,)
     if warm and chosen.target_only and len(all_dqn) == len(learners):
         steps = sum(learner.steps for learner in all_dqn)
         slots = [(chosen.order[-1], replace(all_dqn[-1], steps=steps))]
-    made: list[Stage] = []
+    # Whoever starts without a policy fills the replay at random; shaping gives none.
+    start, made = chosen.start, list[Stage]()
+    known = (start.base, start.initial, start.prior) if start else ()
+    has_policy = start is None or any(q is not ZERO for q in known)
     for number, (task, learner) in enumerate(slots, start=1):
         env = chosen.tasks[task]
         if isinstance(learner, FQI) and not learner.new_data:
             learner = _with_data(learner, env, made)
-        # Whoever starts without a policy fills the replay at random.
-        if isinstance(learner, DQN) and made and _knows_a_policy(chosen.start):
+        if isinstance(learner, DQN) and made and has_policy:
             learner = replace(learner, random_steps=0)
         made.append(Stage(number, task + 1, env, learner, chosen.transfers, 0))
     return _placed(made)
@@ -87,8 +92,6 @@ def capped(
 def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
     """Raise ConfigError for learners that don't suit the slots, or each other."""
     n, start = len(chosen.order), chosen.start or StageInit()
-    if n == 1 and not start.behavior:
-        chosen.check()
     if len(learners) != n:
         why = f"there are {len(learners)} learners for {n} slots"
         raise ConfigError("algorithm.learners", list(learners), why)
@@ -143,9 +146,6 @@ def _check_dqn(chosen: Composition, learner: DQN, start: StageInit) -> None:
     if size < learner.batch_size or size <= learner.learning_starts:
         why = f"must hold a batch, batch_size={learner.batch_size}, and more than "
         why += f"learning_starts={learner.learning_starts}"
-    elif not 0 < learner.learning_rate < math.inf:
-        key, value = "algorithm.learning_rate", learner.learning_rate
-        why = "must be a number above 0"
     elif not widths or not all(isinstance(w, Integral) and w >= 1 for w in widths):
         key, value = "algorithm.hidden", list(widths)
         why = "must be a list of layer widths, each at least 1"
@@ -178,9 +178,6 @@ def check_lspi(learner: LSPI) -> None:
     """Raise ConfigError for settings of LSPI's out of bounds."""
     check_numbers("algorithm.lspi", vars(learner))
     one_of("algorithm.lspi.features", learner.features, FEATURES)
-    if not 0 < learner.noise_std < math.inf:
-        why = "must be above 0: without noise LSTDQ sees one action per state"
-        raise ConfigError("algorithm.lspi.noise_std", learner.noise_std, why)
 
 
 def check_numbers(section: str, values: Mapping[str, Any]) -> None:
@@ -188,10 +185,10 @@ def check_numbers(section: str, values: Mapping[str, Any]) -> None:
     for name, (kind, least, most) in BOUNDS.items():
         value = values.get(name, least)
         fits = isinstance(value, kind) and not isinstance(value, bool)
-        if not fits or not least <= value <= most:
+        if not fits or not least <= value <= most or value == math.inf:
             noun = "an integer" if kind is Integral else "a number"
-            bounds = f"from {least} to {most}"
-            bounds = bounds if most < math.inf else f"of at least {least}"
+            bounds = f"of at least {least}" if least != ABOVE_0 else "above 0"
+            bounds = f"from {least} to {most}" if most < math.inf else bounds
             key = f"{section}.{name}".lstrip(".")
             raise ConfigError(key, value, f"must be {noun} {bounds}")
 
@@ -205,12 +202,6 @@ def _with_data(learner: FQI, env: Env, before: Sequence[Stage]) -> FQI:
         why = "the task's data are kept, so epsilon and episodes must stay the same"
         raise ConfigError("algorithm.new_data", "task", why)
     return learner
-
-
-def _knows_a_policy(start: StageInit | None) -> bool:
-    """Whether a stage has a policy from the start: shaping alone gives none."""
-    known = (start.base, start.initial, start.prior) if start else ()
-    return start is None or any(q is not ZERO for q in known)
 
 
 def _placed(stages: Sequence[Stage]) -> tuple[Stage, ...]:

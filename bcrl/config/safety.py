@@ -100,9 +100,7 @@ def check_file(path: Path) -> None:
         raise BcrlError(f"{path} is larger than {FILE_BYTES // 1024} KiB")
     try:
         check_yaml(path.read_text("utf-8"))
-    except UnicodeDecodeError as error:
-        raise BcrlError(f"{path} isn't UTF-8: {error.reason}") from error
-    except yaml.YAMLError as error:
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
         words = " ".join(str(error).split())
         raise BcrlError(f"{path} can't be read: {words}") from error
     except BcrlError as error:
@@ -126,20 +124,17 @@ def check_yaml(text: str) -> None:
         if isinstance(event, yaml.ScalarEvent) and event.implicit[0]:
             word = event.value
             kind = resolver.resolve(yaml.ScalarNode, word, (True, False))[-5:]
-            if kind == ":bool" and word.lower() not in ("true", "false"):
-                why = "write true or false, or quote on and off where they are names"
-                raise BcrlError(f"has a bare {word}, a truth value to YAML; {why}")
-            if kind in ("2:int", "float") and re.search("[:_xb]|^[+-]?0[0-9]", word):
-                why = "write the number that is meant in digits, or quote a name"
-                read = yaml.safe_load(word)
-                raise BcrlError(f"has a bare {word}, which YAML reads as {read}; {why}")
+            odd = kind == ":bool" and word.lower() not in ("true", "false")
+            digits = kind in ("2:int", "float")
+            if odd or (digits and re.search("[:_xb]|^[+-]?0[0-9]", word)):
+                why = f"has a bare {word}, which YAML reads as {yaml.safe_load(word)}"
+                raise BcrlError(f"{why}; write what is meant, or quote a name")
 
 
 def check_composed(composed: DictConfig, usual: DictConfig | None) -> None:
     """Raise ConfigError for interpolations or keys of Hydra's that aren't allowed.
 
-    `usual` is a config with Hydra's keys at their defaults, or None where nobody could
-    have changed them.
+    `usual` has Hydra's keys at their defaults; None: nobody could have changed them.
     """
     config: Any = OmegaConf.to_container(composed, resolve=False)
     hydra = flat(config.pop("hydra"))

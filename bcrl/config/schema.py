@@ -90,8 +90,7 @@ def section_of_seeds(key: str, value: object) -> dict[str, Any]:
 def check_written(package: str, config: DictConfig) -> None:
     """Check what a file says of seeds and texts; `seeds: 5` becomes the section's keys.
 
-    Raises ConfigError for two ways of naming seeds, and for a number where text is
-    expected: `tag: 1e3`.
+    Raises ConfigError for seeds named twice, and for a number as text: `tag: 1e3`.
     """
     place = "" if package in ("", "_global_") else package.replace("/", ".") + "."
     if not place and None not in (config.get("seed"), config.get("seeds")):
@@ -132,10 +131,7 @@ class _Slurm(SlurmQueueConf):
 
 
 def check_launcher(values: Plain | None) -> None:
-    """Raise ConfigError for a launcher other than Slurm's, or a key that it can't take.
-
-    Its values end in a shell script, so no character of a shell is allowed.
-    """
+    """Raise ConfigError for a launcher other than Slurm's, or a value it can't take."""
     values = {k: v for k, v in (values or {}).items() if v not in (None, [], {})}
     if values == BASIC:
         return
@@ -152,7 +148,7 @@ def check_launcher(values: Plain | None) -> None:
             why = "has characters of a shell"
         elif key.startswith("mem_per") and not re.fullmatch(r"\d+[KMGT]?B?", value):
             why = "must be a size such as 2G or 800M"
-        if why:
+        if why:  # the values end in a shell script
             raise ConfigError(name, value, why)
         if type(value) is int:
             at_least(name, value, key not in ("max_num_timeout", "signal_delay_s"))

@@ -9,6 +9,7 @@ from typing import Any
 from bcrl.common import plugins
 from bcrl.common.checks import construct, one_of
 from bcrl.common.identity import Plain
+from bcrl.config.schema import Choice
 from bcrl.envs import Env
 from bcrl.errors import ConfigError
 from bcrl.learning.curriculum import CURRICULA
@@ -84,14 +85,12 @@ class Composition:
 
 
 def composition(config: Plain, tasks: list[Env]) -> Composition:
-    """The groups' choices; `check` says whether they make sense together."""
-    boost = _component("boosting", config["boosting"], {"off": _Nothing, "on": Boost})
-    transfers = {"none": _Nothing, **TRANSFERS}
-    transfer = _component("transfer", config["transfer"], transfers)
+    """The groups' choices; ConfigError if they make no sense together."""
+    boost = _component("boosting", config["boosting"], {"on": Boost})
+    transfer = _component("transfer", config["transfer"], TRANSFERS)
     order = order_of(config["curriculum"]["name"], tasks)
     made = Composition(tuple(tasks), order, boost, transfer, config["scale"])
-    if len(tasks) == 1 and not (made.start and made.start.behavior):
-        made.check()  # before budgets, which are lists with one entry per task
+    made.check()  # before budgets, which are lists with one entry per task
     return made
 
 
@@ -134,17 +133,14 @@ def _one_task(env: Env) -> str:
     return f"{why}; env.tasks needs at least two values"
 
 
-@dataclass(frozen=True)
-class _Nothing:
-    """`boosting=off`, `transfer=none`."""
-
-
 def _component(group: str, section: Plain, classes: Mapping[str, type]) -> Any:
     """The transfer that a section names, one of ours or a trusted `module.Class`."""
     values = dict(section)
-    name = values.pop("name", None)
+    name, nothing = values.pop("name", None), "off" if group == "boosting" else "none"
+    if name == nothing:
+        construct(group, Choice, section)
+        return None
     if group == "transfer" and isinstance(name, str) and "." in name:
         return construct(group, plugins.component("transfer.name", name, name), values)
-    one_of(f"{group}.name", name, list(classes))
-    made = construct(group, classes[name], values)
-    return None if isinstance(made, _Nothing) else made
+    one_of(f"{group}.name", name, [nothing, *classes])
+    return construct(group, classes[name], values)
