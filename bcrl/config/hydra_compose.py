@@ -85,10 +85,7 @@ def composed(
     except (HydraException, OmegaConfBaseException) as error:
         message = first_lines(error)
     except Exception as error:  # e.g. YAML's own; composing runs nothing of ours
-        text = f"the configs can't be read: {first_lines(error)}"
-        if "in defaults : bool" in text:
-            text += "; quote on and off, YAML takes them for booleans"
-        raise BcrlError(text) from error
+        raise BcrlError(f"the configs can't be read: {first_lines(error)}") from error
     if unknown := UNKNOWN.match(message):
         key = next(filter(None, unknown.groups()))
         raise Unknown(message if message[:3] == "In " else f"{key}: unknown key", key)

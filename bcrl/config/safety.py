@@ -128,7 +128,7 @@ def check_yaml(text: str) -> None:
             digits = kind in ("2:int", "float")
             if odd or (digits and re.search("[:_xb]|^[+-]?0[0-9]", word)):
                 why = f"has a bare {word}, which YAML reads as {yaml.safe_load(word)}"
-                raise BcrlError(f"{why}; write what is meant, or quote a name")
+                raise BcrlError(f"{why}; write what is meant, or quote it as a name")
 
 
 def check_composed(composed: DictConfig, usual: DictConfig | None) -> None:

@@ -55,7 +55,7 @@ def test_what_names_a_directory_is_a_plain_word(tmp_path):
         ("seeds: {count: many}", "seeds.count; many"),
         ("seeds: {cuont: 3}", "seeds.cuont"),
         ("seeds: [", "can't be read; mine.yaml"),
-        ("defaults:\n  - override /curriculum: off", "quote on and off"),
+        ("defaults:\n  - override /curriculum: off", "bare off; quote it"),
         ("algorithm: {iterations: 0}", "algorithm.iterations=0"),
         ("env: {horizon: 5:00}", "5:00; 300"),
         ("seeds: {first: 010}", "010; 8"),

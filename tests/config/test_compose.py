@@ -4,9 +4,7 @@ import itertools
 from pathlib import Path
 
 import pytest
-import yaml
 
-from bcrl.config import jobs
 from bcrl.config.hydra_compose import CONF, options
 from bcrl.errors import BcrlError
 from bcrl.learning.curriculum import CURRICULA
@@ -17,8 +15,6 @@ from tests.config.helpers import own
 from tests.conftest import plan, plans
 
 MAZE, LINEAR = "env=maze", ("env=linear_system", "algorithm=dqn")
-#: What stands by itself; the other env wants an id (tests/test_gymnasium.py).
-ENVS = [env for env in options("env") if env != jobs.OPEN]
 
 
 @pytest.mark.parametrize(
@@ -143,21 +139,6 @@ def test_every_combination_composes_or_is_rejected_with_a_reason(algorithm):
     del names["rejected"]
     # A name means one thing, and a mixture of readings has a separate directory.
     assert all(len(chosen) == 1 for chosen in names.values()), names
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("env", ENVS)
-def test_every_regressor_and_budget_composes_or_is_rejected_with_a_reason(env):
-    for regressor in options("algorithm/regressor"):
-        ended = outcome(f"env={env}", f"algorithm/regressor={regressor}")
-        assert (ended == "rejected") == (regressor == "tabular" and env != "maze")
-    n_tasks = len(plan(f"env={env}").tasks)
-    for budget in options("budget"):
-        algorithm = budget.rsplit("_", 1)[1]
-        ended = outcome(f"env={env}", f"algorithm={algorithm}", f"budget={budget}")
-        values = yaml.safe_load((CONF / f"budget/{budget}.yaml").read_text())
-        lengths = {len(value) for value in values.values() if isinstance(value, list)}
-        assert (ended != "rejected") == (lengths <= {n_tasks}), budget
 
 
 @pytest.mark.slow
