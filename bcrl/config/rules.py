@@ -96,11 +96,9 @@ def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
         why = f"there are {len(learners)} learners for {n} slots"
         raise ConfigError("algorithm.learners", list(learners), why)
     for slot, learner in enumerate(learners):
-        if not hasattr(learner, "learn") or isinstance(learner, type):
-            why = "is no learner: an object with settings and `learn`, such as DQN()"
-            raise ConfigError("algorithm.learners", learner, why)
-        if isinstance(learner, FQI) != isinstance(learners[-1], FQI):
-            why = "a course has learners of one family, FQI or DQN"
+        same = isinstance(learner, FQI) == isinstance(learners[-1], FQI)
+        if isinstance(learner, type) or not hasattr(learner, "learn") or not same:
+            why = "is no learner with `learn`, such as DQN(), or stands beside FQI"
             raise ConfigError("algorithm.learners", learner, why)
         if isinstance(learner, FQI):
             _check_fqi(chosen, learner, chosen.slots[slot], start)
@@ -120,10 +118,10 @@ def _check_fqi(chosen: Composition, learner: FQI, env: Env, start: StageInit) ->
     check_numbers("algorithm", vars(learner))
     regressor, why = learner.regressor, ""
     key, value = "algorithm.regressor", cast(Any, regressor)
-    if isinstance(regressor, type) or not hasattr(regressor, "fit"):
-        why = "is no regressor"
-    elif not hasattr(regressor, "finite_only"):
-        why = "is no regressor of bcrl's; Sklearn(estimator) makes one of it"
+    if isinstance(regressor, type) or not hasattr(regressor, "finite_only"):
+        why = (
+            "is no regressor of bcrl's; Sklearn(estimator) makes one of scikit-learn's"
+        )
     elif regressor.finite_only and not is_finite(env):
         why = f"needs finitely many states, which {env.name} has not"
     elif learner.shared_data and learner.epsilon < 1:

@@ -189,6 +189,7 @@ def test_choosing_the_groups_is_the_same_as_naming_the_variant():
     ):
         here, there = plan(*LINEAR, f"variant={named}"), plan(*LINEAR, *groups.split())
         assert (here.name, here.stages) == (there.name, there.stages)
+        assert plan(*LINEAR, f"variant={named}", *groups.split()).name == here.name
     sb = plan(*LINEAR, "boosting=on", "transfer=shaping")
     assert sb.variant == "SB-DQN" and {s.task for s in sb.stages} == {2}
 
