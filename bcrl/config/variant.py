@@ -73,8 +73,8 @@ class Composition:
         elif residual and getattr(self.tasks[-1], "actions", None) is None:
             why = "combines actions as vectors, which env.action_vectors has to name"
         elif residual and start.base is not ZERO:
-            why = "has a Q of its own actions, a base one of those that are executed: "
-            why += "boosting=off"
+            why = "learns the Q-values of its own actions, but a base has those of the "
+            why += "executed actions: boosting=off"
         if why:
             raise ConfigError("transfer", transfer, why)
         for key, one in (("transfer", transfer), ("boosting", boost)):
