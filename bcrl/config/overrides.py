@@ -9,6 +9,7 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import PurePath
+from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser import types
@@ -23,16 +24,10 @@ from bcrl.config.schema import section_of_seeds, texts
 from bcrl.errors import BcrlError, ConfigError
 
 JOBS = 1_000  # of one sweep
-#: A quoted string, or bare text up to what ends it.
-WORD = re.compile(
-    r"(?P<quoted>'(?:\\.|[^'\\])*'|\"(?:\\.|[^\"\\])*\")"
-    r"|(?P<bare>(?:\$\{[^{}]*\}|[^,\[\](){}'\"$]|\$(?!\{))+)"
-)
-#: Functions whose arguments are no names, and what Hydra may take for a number.
+#: Functions of names, and those whose arguments are no names.
 CHOICE = re.compile(r"^\s*(?:choice\((.*)\)|(?:shuffle|sort)\(([^()=]*)\))\s*$")
 NOW = re.compile(r"\$\{now:([^{}]*)\}")
 COMPUTED = re.compile(r"\s*(range|interval|glob|int|float|bool|str|json_str)\s*\(")
-NUMBER = re.compile(r"[+-]?[\d.][\w.+-]*|[+-]?(nan|inf)|true|false", re.IGNORECASE)
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:
@@ -80,46 +75,45 @@ def _canonical(text: str, folders: Paths) -> Iterator[str]:
     key, value = override.key_or_group, override.value()
     head, equals, raw = text.partition("=")
     is_group = key in group_names(folders)
+    swept = isinstance(value, types.ChoiceSweep)
+    values: list[Any] = value.list if swept else [value]  # type: ignore[union-attr]
     if override.is_delete() or not equals:
         yield text
     elif key in ("seed", "seeds") or (key == "seeds.only" and value is not None):
         # By the section's keys, also in a sweep.
-        values = value.list if isinstance(value, types.ChoiceSweep) else [value]
         sections = [section_of_seeds(key, each) for each in values]
         if len({tuple(section) for section in sections}) > 1:
             raise ConfigError(key, raw, "sweep over either numbers or lists")
         for name in sections[0]:
-            each = [str(section[name]).replace(" ", "") for section in sections]
-            yield f"seeds.{name}={'null' if each[0] == 'None' else ','.join(each)}"
+            those = [str(section[name]).replace(" ", "") for section in sections]
+            yield f"seeds.{name}={'null' if those[0] == 'None' else ','.join(those)}"
     elif isinstance(value, types.Glob):
         known = options(key, folders) if is_group else ["no group"]
         names = value.filter(known) if is_group else []
         if not names:
             why = f"glob(…) picks options of a group; {key} has {', '.join(known)}"
             raise ConfigError(key, raw, why)
-        yield f"{head}={_as_text(','.join(names))}"
+        yield from _canonical(f"{head}={','.join(names)}", folders)
     elif COMPUTED.match(raw) or (is_group and isinstance(value, list)):
         yield text
     elif is_group or key in texts() or key.endswith((".name", ".id")):
-        chosen = CHOICE.sub(r"\1\2", raw)
-        yield f"{head}={_as_text(chosen, key == 'runs_dir')}"
+        written = CHOICE.sub(r"\1\2", raw).split(",") if swept else [raw]
+        if len(written) == len(values):
+            each = (_as_text(w, v, key) for w, v in zip(written, values, strict=True))
+            text = f"{head}={','.join(each)}"
+        yield text
     else:
         yield text
 
 
-def _as_text(raw: str, is_folder: bool = False) -> str:
-    """A value in which Hydra finds no numbers, and no folder leads out of this one."""
-
-    def written(found: re.Match) -> str:
-        text = found["bare"] or re.sub(r"\\(['\"])", r"\1", found["quoted"][1:-1])
-        text, changed = text.strip(), False
-        if is_folder and ".." in PurePath(text).parts and not os.path.isabs(text):
-            text, changed = os.path.realpath(text), True
-        elif found["bare"] and NUMBER.fullmatch(text):
-            changed = not isinstance(parse([f"x={text}"])[0].value(), str)
-        return '"' + text.replace('"', r"\"") + '"' if changed else found[0]
-
-    return WORD.sub(written, raw)
+def _as_text(written: str, value: object, key: str) -> str:
+    """A value as it was written: no number, and no folder that leads outside."""
+    text = value.text if isinstance(value, types.QuotedString) else str(value)
+    if key == "runs_dir" and ".." in PurePath(text).parts and text[0] not in "/$":
+        written = os.path.realpath(text)
+    elif not isinstance(value, int | float):
+        return written
+    return '"' + written.strip().replace('"', r"\"") + '"'
 
 
 def product(overrides: Sequence[Override]) -> list[list[str]]:

@@ -96,7 +96,7 @@ def test_a_parameter_has_to_have_an_effect():
         ([], LEARNER, (), "0 tasks"),
         ([OpenCorridor()], [LEARNER] * 2, (), "there are 2 learners"),
         ([OpenCorridor()], LEARNER, (Boost,), r"write Boost\(\)"),
-        ([OpenCorridor()], LEARNER, (ResidualPolicy(),), "FQI learns from whole"),
+        ([OpenCorridor()], LEARNER, (ResidualPolicy(),), "one task"),
         ([OpenCorridor()], FQI(1, 1, Tabular), (), "is no regressor"),
         ([OpenCorridor()], "FQI", (), "learners"),
     ],
