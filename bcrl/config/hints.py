@@ -153,10 +153,11 @@ class Hints:
         key, value = override.key_or_group, override.value()
         raw = str(override.input_line).partition("=")[2]
         group, is_text = key.replace(".", "/"), isinstance(value, str)
-        if override.is_delete() and key in Config.__annotations__:
-            return "can't be deleted: every run needs a choice of it, or its default"
-        if key in self.groups and not isinstance(value, str | Sweep | Glob | None):
-            return f"name one option; {self.of_option(key, value)}"
+        if override.is_delete():
+            why = "can't be deleted: every run needs a choice of it, or its default"
+            return why if key in Config.__annotations__ else None
+        if key in self.groups and not isinstance(value, str | Sweep | Glob):
+            return f"name one option, or leave {key} out; {self.of_option(key, value)}"
         if key in OPTIONAL and isinstance(value, str | Sweep):
             swept = isinstance(value, Sweep)
             for name in override.sweep_string_iterator() if swept else [value]:
