@@ -42,7 +42,8 @@ def arguments() -> Namespace:
 
             chosen = tuple(each for each in words if re.match(r"[^-].*=", each))
             # What --runs-dir says its key says, too.
-            near = closest(name, set(names) - {"--runs-dir"}, 0.7)
+            long = {each for each in names if each[:2] == "--"} - {"--runs-dir"}
+            near = closest(name, long, 0.7)
             meant = "" if near else Hints(chosen).meant(words, place)
             meant = meant or f"did you mean {near}?"
             raise BcrlError(f"{word}: unknown flag; {meant}")
