@@ -111,6 +111,8 @@ class Hints:
 
     def _with(self, key: str, value: str) -> str:
         """The key with its value, and before it the option that brings the key."""
+        if key == "env.id" and (ours := gymnasium(value)):
+            return ours
         if key in self.groups:
             return self._choice(key, value) or f"{key}={value or '…'}"
         if key in ("seeds", "seed"):

@@ -143,7 +143,8 @@ def _plan(
             group = key.removeprefix("override /")
             if choices.get(group, option) != option:
                 why = f"means {group}={option}, but {group}={choices[group]} is chosen"
-                raise ConfigError("variant", name, f"{why}; leave one of them out")
+                line = f"env={choices['env']} variant={name}"
+                raise ConfigError("variant", name, f"{why}; did you mean {line}?")
     config = _plain(job)
     for key, name in plugins.named_code(config):
         said = (o.lstrip("+").partition("=") for o in typed or ())
