@@ -4,8 +4,6 @@ A key's comment is a sentence, then `Unit: ….` and `Allowed: ….` where they 
 ends with a full stop. The comment at the top of a file describes the option.
 """
 
-from __future__ import annotations
-
 import re
 import textwrap
 from dataclasses import dataclass, field
@@ -49,10 +47,11 @@ class Entry:
         """The default, or each default with its options."""
         options: dict[str, list[str]] = {}
         for option, value in self.defaults.items():
-            options.setdefault(_shown(value), []).append(option)
-        if len(options) == 1:
-            return next(iter(options))
-        return "; ".join(f"{value} ({', '.join(of)})" for value, of in options.items())
+            flow = yaml.safe_dump(value, default_flow_style=True, width=10**6)
+            text = value if isinstance(value, str) else flow.split("\n")[0]
+            options.setdefault("required" if text == "???" else text, []).append(option)
+        each = [f"{value} ({', '.join(of)})" for value, of in options.items()]
+        return "; ".join(each if len(each) > 1 else options)
 
 
 def entries() -> list[Entry]:
@@ -60,11 +59,10 @@ def entries() -> list[Entry]:
     found = [e for group in ("", *GROUPS) for e in _of_group(group)]
     for path in sorted(CONF.glob("budget/*.yaml")):
         env, _, algorithm = path.stem.rpartition("_")
-        values = yaml.safe_load(path.read_text("utf-8"))
-        for entry in (e for e in found if e.group == "algorithm"):
-            name = entry.key.removeprefix("algorithm.")
-            if algorithm in entry.defaults and name in values:
-                entry.defaults[f"env={env}"] = values[name]
+        for key, value in yaml.safe_load(path.read_text("utf-8")).items():
+            for entry in found:
+                if entry.key == f"algorithm.{key}" and algorithm in entry.defaults:
+                    entry.defaults[f"env={env}"] = value
     return found
 
 
@@ -79,10 +77,7 @@ def option_comments(group: str) -> dict[str, str]:
 
 
 def describe(word: str) -> str:
-    """What a key does, or a list: a group's options, the keys below, all keys for "".
-
-    Raises BcrlError for an unknown key.
-    """
+    """What a key does, or what a group or section has; "": a list of all keys."""
     key, known = word.partition("=")[0], entries()
     if chosen := [entry for entry in known if entry.key == key]:
         return "\n".join([key, *(_block(entry, len(chosen) > 1) for entry in chosen)])
@@ -95,8 +90,8 @@ def describe(word: str) -> str:
         return "\n".join(f"{name}: {text.rstrip('.')}" for name, text in listed.items())
     from bcrl.config.hints import Hints  # composes a config, which takes a while
 
-    near = re.search(r"([\w./]+)=[^ ]*\?$", Hints(()).mean(key, ""))
-    hint = f"did you mean {near[1]}?" if near else "bcrl --describe lists all keys"
+    near = Hints(()).key(key)
+    hint = f"did you mean {near}?" if near else "bcrl --describe lists all keys"
     raise BcrlError(f"--describe {key}: unknown key; {hint}")
 
 
@@ -111,26 +106,22 @@ def _block(entry: Entry, several: bool) -> str:
 
 def _of_group(group: str) -> list[Entry]:
     """A group's entries; a key without a comment joins the first entry of its name."""
-    found: list[Entry] = []
-    files = sorted(CONF.glob(f"{group}/*.yaml" if group else "config.yaml"))
-    texts = {path.stem: path.read_text("utf-8") for path in files}
     prefix = f"{group.replace('/', '.')}." if group else ""
-    for described in (True, False):
-        for option, text in texts.items():
-            at_top = not group or "@package _global_" in text
-            comments, skipped = _comments(text), {"defaults", "_target_", "hydra"}
-            values = yaml.safe_load(text) or {}
-            for name, value in flat(values).items():
-                key, comment = f"{'' if at_top else prefix}{name}", comments.get(name)
-                if name.split(".")[0] in skipped or not key.startswith(prefix):
-                    continue
-                if bool(comment) != described:
-                    continue
-                of_key = [entry for entry in found if entry.key == key]
-                same = [e for e in of_key if comment in (None, e.comment)]
-                if not same:
-                    found += (same := [Entry(group, key, comment or "")])
-                same[0].defaults[option] = value
+    rows, found = [], list[Entry]()
+    for path in sorted(CONF.glob(f"{group}/*.yaml" if group else "config.yaml")):
+        text = path.read_text("utf-8")
+        before = "" if not group or "@package _global_" in text else prefix
+        comments = _comments(text)
+        for name, value in flat(yaml.safe_load(text) or {}).items():
+            key, skipped = f"{before}{name}", ("defaults", "_target_", "hydra")
+            if name.split(".")[0] not in skipped and key.startswith(prefix):
+                rows.append((comments.get(name), key, path.stem, value))
+    for comment, key, option, value in sorted(rows, key=lambda row: row[0] is None):
+        same = [e for e in found if e.key == key and comment in (None, e.comment)]
+        if not same:
+            same = [Entry(group, key, comment or "")]
+            found += same
+        same[0].defaults[option] = value
     return found
 
 
@@ -151,9 +142,3 @@ def _comments(text: str) -> dict[str, str]:
             else:
                 above = f"{above} {comment[1]}".strip()
     return {name: text for name, text in found.items() if text.endswith(".")}
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, str):
-        return "required" if value == "???" else value
-    return yaml.safe_dump(value, default_flow_style=True, width=10**6).split("\n")[0]

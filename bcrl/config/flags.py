@@ -1,17 +1,16 @@
 """The command's flags, its help, and what Tab completes."""
 
-from __future__ import annotations
-
 import argparse
+import contextlib
 import os
+import re
 import sys
 import textwrap
 from argparse import Namespace
-from collections.abc import Sequence
 from itertools import takewhile
 from pathlib import Path
 from string import Template
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from hydra._internal.utils import get_args_parser
 from omegaconf import OmegaConf
@@ -19,43 +18,41 @@ from omegaconf import OmegaConf
 from bcrl import __version__
 from bcrl.common.files import user_folder
 from bcrl.common.identity import flat
-from bcrl.config.hydra_compose import (
-    CONFIG_NAME,
-    PACKAGE,
-    composed,
-    group_names,
-    options,
-)
+from bcrl.config.hydra_compose import composed, group_names, options
 from bcrl.config.safety import check_override
 from bcrl.errors import BcrlError, closest
 
-HELP = PACKAGE / "config" / "help.txt"
-WIDTH, HANGING = 88, 21  # columns of the help, and where an option's text begins
+HELP = Path(__file__).with_name("help.txt")
 #: Flags of which Hydra knows nothing, or that are handed to it in another way.
-_OURS = (
-    *("describe", "dry_run", "status", "runs_dir", "overrides", "config_dir"),
-    *("help", "version"),
-)
+_OURS = {"describe", "dry_run", "status", "runs_dir", "overrides", "config_dir"}
 
 
 def arguments() -> Namespace:
-    """What the command line asks for; BcrlError for an unknown flag.
-
-    If no folder of configs is named, it is ~/.config/bcrl where that exists;
-    `unnamed` says so.
-    """
+    """What the command line asks for; `unnamed`: it names no folder of configs."""
     flags, words = flag_parser(), sys.argv[1:]
-    for place, word in enumerate(takewhile(lambda word: word != "--", words)):
+    names = _names(flags)
+    for word in words:
         check_override(word)
-        if word.startswith("-") and not _is_flag(word, flags):
-            raise BcrlError(f"{word}: unknown flag; {_meant(words, place, flags)}")
+    for place, word in enumerate(takewhile(lambda word: word != "--", words)):
+        name = word.partition("=")[0]
+        letters = len(name) > 1 and all(f"-{letter}" in names for letter in name[1:])
+        is_long = name[:2] == "--" and any(each.startswith(name) for each in names)
+        if name[:1] == "-" and not (name in names or letters or is_long):
+            from bcrl.config.hints import Hints  # a large import
+
+            chosen = tuple(each for each in words if re.match(r"[^-].*=", each))
+            # What --runs-dir says its key says, too.
+            long = {each for each in names if each[:2] == "--"} - {"--runs-dir"}
+            near = closest(name, long, 0.7)
+            meant = "" if near else Hints(chosen).meant(words, place)
+            meant = meant or f"did you mean {near}?"
+            raise BcrlError(f"{word}: unknown flag; {meant}")
     asked = flags.parse_intermixed_args()
     if asked.runs_dir is not None:
         quoted = asked.runs_dir.replace('"', r"\"")
         asked.overrides.append(f'runs_dir="{quoted}"')
     asked.unnamed = asked.config_dir is None
-    folder = asked.config_dir or own_folder()
-    asked.config_dir = os.path.abspath(folder) if folder else None
+    asked.config_dir = _folder(asked)
     return asked
 
 
@@ -64,7 +61,7 @@ def for_hydra(asked: Namespace) -> list[str]:
     given = []
     for action in flag_parser()._actions:
         value = getattr(asked, action.dest, None)
-        if value and action.dest not in _OURS:
+        if value and action.dest not in {*_OURS, "help", "version"}:
             short, long = (f(action.option_strings, key=len) for f in (min, max))
             given.append(short if value is True else f"{long}={value}")
     return given
@@ -81,12 +78,12 @@ def flag_parser() -> argparse.ArgumentParser:
     result.add_argument("--dry-run", action="store_true", help="list jobs and costs")
     result.add_argument("--runs-dir", metavar="PATH", help="as runs_dir=PATH")
     result.add_argument("--status", action="store_true", help="list what is done")
-    result.error = _reject  # type: ignore[method-assign]
+
+    def reject(message: str) -> NoReturn:
+        raise BcrlError(f"{message}; see bcrl --help")
+
+    result.error = reject  # type: ignore[method-assign]
     return result
-
-
-def _reject(message: str) -> NoReturn:
-    raise BcrlError(f"{message}; see bcrl --help")
 
 
 def _names(flags: argparse.ArgumentParser) -> list[str]:
@@ -94,37 +91,12 @@ def _names(flags: argparse.ArgumentParser) -> list[str]:
     return [each for action in flags._actions for each in action.option_strings]
 
 
-def _is_flag(word: str, flags: argparse.ArgumentParser) -> bool:
-    """Whether a word is a flag, may be abbreviated and with its value."""
-    name, known = word.partition("=")[0], _names(flags)
-    if name.startswith("--"):
-        return any(each.startswith(name) for each in known)
-    return name in known or (
-        len(name) > 1 and all(f"-{letter}" in known for letter in name[1:])
-    )
-
-
-def _meant(words: Sequence[str], place: int, flags: argparse.ArgumentParser) -> str:
-    """What an unknown flag probably means."""
-    from bcrl.config.hints import Hints
-
-    word = words[place]
-    follow = takewhile(lambda w: "=" not in w and w[:1] != "-", words[place + 1 :])
-    value = next(follow, None)
-    if value and value.isdecimal():  # --seeds 0 1 2
-        value = " ".join([value, *takewhile(str.isdecimal, follow)])
-    chosen = tuple(each for each in words if "=" in each and not each.startswith("-"))
-    names = {name for name in _names(flags) if name[:2] == "--"}
-    names -= {"--runs-dir"}  # its key says as much
-    near = closest(word.partition("=")[0], names, 0.7)
-    line = near or Hints(chosen).line(word, value) or closest(word, names, 0.6)
-    return f"did you mean {line}?" if line else "see bcrl --help"
-
-
-def own_folder() -> Path | None:
-    """The user's folder of configs, ~/.config/bcrl, if it is there."""
+def _folder(asked: Namespace) -> str | None:
+    """The folder of configs, absolute: the one that is named, or ~/.config/bcrl."""
     base = user_folder("XDG_CONFIG_HOME", ".config")
-    return base / "bcrl" if base and (base / "bcrl").is_dir() else None
+    own = base / "bcrl" if base and (base / "bcrl").is_dir() else None
+    folder = asked.config_dir or own
+    return os.path.abspath(folder) if folder else None
 
 
 def short() -> str:
@@ -138,14 +110,11 @@ def manual(config_dir: str | None) -> str:
     """The help, with the options of every group, those of the user's folder too."""
     folders = (config_dir,) if config_dir else ()
     text = Template(HELP.read_text("utf-8"))
-    listed = {
-        name: ", ".join(options(name.replace("__", "/"), folders))
-        for name in text.get_identifiers()
-    }
-    lines = text.substitute(listed).splitlines()
-    hanging = " " * HANGING
-    wrapped = [textwrap.fill(x, WIDTH, subsequent_indent=hanging) for x in lines]
-    return "\n".join(wrapped)
+    names = text.get_identifiers()
+    known = {name: options(name.replace("__", "/"), folders) for name in names}
+    lines = text.substitute({n: ", ".join(known[n]) for n in known}).splitlines()
+    hanging = " " * 21  # where an option's text begins
+    return "\n".join(textwrap.fill(x, 88, subsequent_indent=hanging) for x in lines)
 
 
 def completions(line: str) -> list[str]:
@@ -159,26 +128,19 @@ def completions(line: str) -> list[str]:
         typed, _ = flags.parse_known_intermixed_args(words)
     except BcrlError:  # a flag's own argument is missing: the shell proposes files
         return []
-    folder = typed.config_dir or own_folder()
-    folders = (os.path.abspath(folder),) if folder else ()
-    key, equals, value = word.partition("=")
+    folder = _folder(typed)
+    folders = (folder,) if folder else ()
+    key, equals, _ = word.partition("=")
     if equals:
-        return [f"{key}={o}" for o in options(key, folders) if o.startswith(value)]
+        found = [f"{key}={option}" for option in options(key, folders)]
+        return [each for each in found if each.startswith(word)]
     chosen = any(o.startswith(("env=", "experiment=")) for o in typed.overrides)
     # Without an env nothing composes; most keys are the same in all of them.
     overrides = [o for o in typed.overrides if not o.startswith("hydra.")]
     asked = (*["env=maze"] * (not chosen), *overrides)
-    known = {
-        group: None for group in group_names(folders) if not group.startswith("tuned")
-    }
-    try:
-        job = OmegaConf.to_container(composed(CONFIG_NAME, asked, folders))
-        known |= {k: v for k, v in flat(job).items() if not k.startswith("hydra.")}  # type: ignore
-    except BcrlError:
-        pass  # the command itself says what is wrong
-    found = set()
-    for each in known:
-        if each.startswith(word):
-            step, dot, _ = each[len(word) :].partition(".")
-            found.add(f"{word}{step}{dot or '='}")
-    return sorted(found)
+    known = [name for name in group_names(folders) if not name.startswith("tuned")]
+    with contextlib.suppress(BcrlError):  # the command itself says what is wrong
+        job: Any = OmegaConf.to_container(composed(asked, folders))
+        known += [key for key in flat(job) if not key.startswith("hydra.")]
+    rest = (name[len(word) :].partition(".") for name in known if name.startswith(word))
+    return sorted({f"{word}{step}{dot or '='}" for step, dot, _ in rest})

@@ -1,7 +1,5 @@
 """Hydra's composition of one job, and what the folders of configs hold."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re
@@ -20,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bcrl.common.identity import Plain
 from bcrl.config import safety, schema
-from bcrl.errors import BcrlError, did_you_mean
+from bcrl.errors import BcrlError
 
 PACKAGE = Path(__file__).resolve().parents[1]
 #: In a wheel the configs lie inside the package, in a checkout beside it.
@@ -34,12 +32,11 @@ UNKNOWN = re.compile(
     r"|Multiple values for ([^.\s]+)\."
     r"|In '[^']*': ConfigKeyError .* Key '([^']+)' not in 'Config'"
 )
-NO_ENV = "You must specify 'env'"
 Paths = tuple[str, ...]  # of folders of configs, besides our own
 
 
 class Unknown(BcrlError):
-    """An unknown key, or an unknown option of a group."""
+    """An unknown key, or an unknown option of a group; "": the env is missing."""
 
     def __init__(self, text: str, key: str, option: str | None = None) -> None:
         super().__init__(text)
@@ -63,14 +60,14 @@ def register_plugins() -> None:
 def searchpath(folders: Paths) -> list[str]:
     """The override that adds folders to Hydra's search path, if there are any."""
     quoted = [folder.replace("'", r"\'") for folder in folders]
-    places = ",".join(
-        f"'{safety.ConfigFolder.scheme()}://{folder}'" for folder in quoted
-    )
-    return [f"hydra.searchpath=[{places}]"] if folders else []
+    places = [f"'{safety.ConfigFolder.scheme()}://{folder}'" for folder in quoted]
+    return [f"hydra.searchpath=[{','.join(places)}]"] if folders else []
 
 
 @cache
-def composed(name: str, overrides: tuple[str, ...], folders: Paths) -> DictConfig:
+def composed(
+    overrides: tuple[str, ...], folders: Paths = (), name: str = CONFIG_NAME
+) -> DictConfig:
     """One job's config, composed from its overrides; BcrlError says what is wrong."""
     register_plugins()
     try:
@@ -81,80 +78,64 @@ def composed(name: str, overrides: tuple[str, ...], folders: Paths) -> DictConfi
     except BcrlError:
         raise
     except MissingConfigException as error:
-        raise _missing(error) from error
+        group, _, option = (error.missing_cfg_file or "").rpartition("/")
+        if not group or error.options is None:
+            raise BcrlError(first_lines(error)) from error
+        raise Unknown(f"{group}={option}: unknown option", group, option) from error
     except (HydraException, OmegaConfBaseException) as error:
         message = first_lines(error)
     except Exception as error:  # e.g. YAML's own; composing runs nothing of ours
-        hint = "; quote on and off, YAML takes them for booleans" * (
-            "in defaults : bool" in str(error)
-        )
-        text = f"the configs can't be read: {first_lines(error)}{hint}"
-        raise BcrlError(text) from error
+        raise BcrlError(f"the configs can't be read: {first_lines(error)}") from error
     if unknown := UNKNOWN.match(message):
         key = next(filter(None, unknown.groups()))
         raise Unknown(message if message[:3] == "In " else f"{key}: unknown key", key)
-    if message.startswith(NO_ENV):
-        raise Unknown(message, "env")
+    if message.startswith("You must specify 'env'"):
+        raise Unknown(message, "")
     raise BcrlError(message)
-
-
-def _missing(error: MissingConfigException) -> BcrlError:
-    group, _, option = (error.missing_cfg_file or "").rpartition("/")
-    if not group or error.options is None:
-        return BcrlError(first_lines(error))
-    meant = did_you_mean(option, error.options)
-    return Unknown(f"{group}={option}: {meant}", group, option)
 
 
 def plain(section: DictConfig) -> Plain:
     """A section with its interpolations resolved, as dicts, lists and scalars."""
     try:
-        values: Any = OmegaConf.to_container(
-            section, resolve=True, throw_on_missing=True
-        )
+        return OmegaConf.to_container(section, resolve=True, throw_on_missing=True)  # type: ignore
     except OmegaConfBaseException as error:
         raise BcrlError(first_lines(error)) from error
     except RecursionError as error:
         raise BcrlError("an interpolation, ${…}, refers to itself") from error
-    return values
 
 
 def first_lines(error: BaseException) -> str:
     """An error's own words, without the key and type listing that OmegaConf appends."""
-    lines = str(error).strip().splitlines()
-    if not lines and error.__cause__ is not None:
-        return first_lines(error.__cause__)
-    listing = r"\s*(full_key|reference_type|object_type)"
-    text = " ".join(x.strip() for x in lines if not re.match(listing, x))
-    if error.__cause__ is not None and text.startswith("Error merging"):
-        return f"{text.split()[-1]}: {first_lines(error.__cause__)}"
-    key = next((x.split(":", 1)[1].strip() for x in lines if "full_key" in x), "")
+    text, *listing = re.split(r"\n *full_key: *(.*)", str(error), maxsplit=1)
+    text, key, cause = " ".join(text.split()), "".join(listing[:1]), error.__cause__
+    if cause is not None and not text:
+        return first_lines(cause)
+    if cause is not None and text.startswith("Error merging"):
+        text, key = first_lines(cause), text.split()[-1]
     text = text or type(error).__name__
-    return text if not key or key in text else f"{key}: {text}"
+    return text if key in text else f"{key}: {text}"
 
 
 def options(group: str, folders: Paths = ()) -> list[str]:
     """The names of a group's options, ours and those of other folders."""
-    places = [folder / group for folder in (CONF, *map(Path, folders))]
-    return sorted(
-        {path.stem for place in places for path in place.glob("*.yaml")}, key=str.lower
-    )
+    files = (Path(folder, group).glob("*.yaml") for folder in (str(CONF), *folders))
+    return sorted({path.stem for each in files for path in each}, key=str.lower)
 
 
 def group_names(folders: Paths = ()) -> list[str]:
     """The names of all groups, `env` and `algorithm/regressor` among them."""
-    found = set()
+    found: set[str] = set()
     for folder in (CONF, *map(Path, folders)):
-        for path in (*folder.glob("*/*.yaml"), *folder.glob("*/*/*.yaml")):
-            found.add(path.parent.relative_to(folder).as_posix())
+        paths = (*folder.glob("*/*.yaml"), *folder.glob("*/*/*.yaml"))
+        found |= {path.parent.relative_to(folder).as_posix() for path in paths}
     return sorted(found)
 
 
 @cache
 def read_option(group: str, name: str | None, folders: Paths = ()) -> dict[str, Any]:
     """What an option's file says; nothing if there is none that can be read."""
-    for folder in (CONF, *map(Path, folders)):
-        path = folder / group / f"{name}.yaml"
+    for folder in (str(CONF), *folders):
+        path = Path(folder, group, f"{name}.yaml")
         with contextlib.suppress(BcrlError):  # whoever chooses it gets the error
             safety.check_file(path)
             found = yaml.safe_load(path.read_text("utf-8"))

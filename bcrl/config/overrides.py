@@ -1,25 +1,33 @@
-"""What a command line sweeps over: overrides parsed, and each job's taken apart."""
+"""The overrides of a command line: parsed, written as they are meant, one by one.
 
-from __future__ import annotations
+Hydra guesses types: `tag=1e3` would be 1000.0. Here a name stays what was typed,
+`seeds=5`, `seeds=[3,7]` and `seed=3` become keys, a folder outside becomes absolute.
+"""
 
 import math
+import os
+import re
 from collections.abc import Iterator, Sequence
+from pathlib import PurePath
+from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser import types
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import (
-    ChoiceSweep,
-    IntervalSweep,
-    Override,
-    RangeSweep,
-)
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
-from bcrl.config.hydra_compose import first_lines
+from bcrl.common.terminal import say
+from bcrl.config.hydra_compose import Paths, first_lines, group_names, now, options
 from bcrl.config.safety import check_override
-from bcrl.errors import BcrlError
+from bcrl.config.schema import section_of_seeds, texts
+from bcrl.errors import BcrlError, ConfigError
 
 JOBS = 1_000  # of one sweep
+#: Functions of names, and those whose arguments are no names.
+CHOICE = re.compile(r"^\s*(?:choice\((.*)\)|(?:shuffle|sort)\(([^()=]*)\))\s*$")
+NOW = re.compile(r"\$\{now:([^{}]*)\}")
+COMPUTED = re.compile(r"\s*(range|interval|glob|int|float|bool|str|json_str)\s*\(")
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:
@@ -37,39 +45,89 @@ def parse(overrides: Sequence[str]) -> list[Override]:
     return parsed
 
 
-def over_experiments(override: Override) -> bool:
-    """Whether it is a sweep over experiments, each of which is a sweep."""
-    return override.key_or_group == "experiment" and override.is_sweep_override()
+def canonical(overrides: Sequence[str], folders: Paths) -> list[str]:
+    """The overrides as Hydra should read them; what is canonical stays as it is."""
+    found: dict[str, str] = {}  # of a key of seeds the last one holds
+    for each in _without_local(overrides):
+        for text in _canonical(each, folders):
+            key = text.partition("=")[0]
+            key = key if key.startswith("seeds.") else text
+            found.pop(key, None)
+            found[key] = text
+    return list(found.values())
 
 
-def experiments(overrides: list[Override], multirun: bool) -> Iterator[list[Override]]:
-    """The overrides with each of the experiments that they sweep over."""
-    chosen = [o for o in overrides if o.key_or_group == "experiment"]
-    if not chosen or not over_experiments(chosen[-1]):
-        yield overrides
-        return
-    if not multirun:
-        raise BcrlError("experiment: several values are a sweep; add -m")
-    rest = [o for o in overrides if o not in chosen]
-    for (one,) in product(chosen[-1:]):
-        yield parse([one]) + rest
+def _without_local(overrides: Sequence[str]) -> Sequence[str]:
+    """The overrides, with workers in place of the former launcher `local`."""
+    if "hydra/launcher=local" not in overrides:
+        return overrides
+    typed = [o.partition("n_jobs=")[2] for o in overrides if "launcher.n_jobs=" in o]
+    line = f"workers={next(filter(str.isdecimal, typed), os.cpu_count())}"
+    say(f"hydra/launcher=local: this launcher is gone; the command runs with {line}")
+    launcher = ("hydra/launcher=", "hydra.launcher.")
+    chosen = [o for o in overrides if not o.startswith(launcher)]
+    return chosen if any(o.startswith("workers=") for o in chosen) else [*chosen, line]
 
 
-def product(overrides: list[Override]) -> list[list[str]]:
-    """The overrides of each job: every combination of the swept values.
+def _canonical(text: str, folders: Paths) -> Iterator[str]:
+    text = NOW.sub(lambda found: now(found[1]), text)
+    (override,) = parse([text])
+    key, value = override.key_or_group, override.value()
+    head, equals, raw = text.partition("=")
+    is_group = key in group_names(folders)
+    swept = isinstance(value, types.ChoiceSweep)
+    values: list[Any] = value.list if swept else [value]  # type: ignore[union-attr]
+    if override.is_delete() or not equals:
+        yield text
+    elif key in ("seed", "seeds") or (key == "seeds.only" and value is not None):
+        # By the section's keys, also in a sweep.
+        sections = [section_of_seeds(key, each) for each in values]
+        if len({tuple(section) for section in sections}) > 1:
+            raise ConfigError(key, raw, "sweep over either numbers or lists")
+        for name in sections[0]:
+            those = [str(section[name]).replace(" ", "") for section in sections]
+            yield f"seeds.{name}={'null' if those[0] == 'None' else ','.join(those)}"
+    elif isinstance(value, types.Glob):
+        known = options(key, folders) if is_group else ["no group"]
+        names = value.filter(known) if is_group else []
+        if not names:
+            why = f"glob(…) picks options of a group; {key} has {', '.join(known)}"
+            raise ConfigError(key, raw, why)
+        yield from _canonical(f"{head}={','.join(names)}", folders)
+    elif COMPUTED.match(raw) or (is_group and isinstance(value, list)):
+        yield text
+    elif is_group or key in texts() or key.endswith((".name", ".id")):
+        written = CHOICE.sub(r"\1\2", raw).split(",") if swept else [raw]
+        if len(written) == len(values):
+            each = (_as_text(w, v, key) for w, v in zip(written, values, strict=True))
+            text = f"{head}={','.join(each)}"
+        yield text
+    else:
+        yield text
 
-    Raises BcrlError for a sweep over more jobs than anyone can mean.
-    """
+
+def _as_text(written: str, value: object, key: str) -> str:
+    """A value as it was written: no number, and no folder that leads outside."""
+    text = value.text if isinstance(value, types.QuotedString) else str(value)
+    if key == "runs_dir" and ".." in PurePath(text).parts and text[0] not in "/$":
+        written = os.path.realpath(text)
+    elif not isinstance(value, int | float):
+        return written
+    return '"' + written.strip().replace('"', r"\"") + '"'
+
+
+def product(overrides: Sequence[Override]) -> list[list[str]]:
+    """The overrides of each job: every combination of the swept values."""
     jobs = 1.0
     for override in overrides:
         sweep = override.value()
-        if isinstance(sweep, IntervalSweep):
+        if isinstance(sweep, types.IntervalSweep):
             line = f"-m {override.key_or_group}=0.1,0.5"
-            why = f"can't be swept over; did you mean {line}?"
-            raise BcrlError(f"{override.input_line}: an interval {why}")
-        if isinstance(sweep, ChoiceSweep):
+            why = f"an interval can't be swept over; did you mean {line}?"
+            raise BcrlError(f"{override.input_line}: {why}")
+        if isinstance(sweep, types.ChoiceSweep):
             jobs *= len(sweep.list)
-        elif isinstance(sweep, RangeSweep):
+        elif isinstance(sweep, types.RangeSweep):
             try:
                 jobs *= max(0.0, (sweep.stop - sweep.start) / sweep.step)  # type: ignore
             except (ArithmeticError, TypeError):  # a step of 0, a number out of range
@@ -78,6 +136,6 @@ def product(overrides: list[Override]) -> list[list[str]]:
             why = f"a sweep of more than {JOBS} jobs, or of none"
             raise BcrlError(f"{override.input_line}: {why}")
     try:
-        return BasicSweeper.split_arguments(overrides, None)[0]
+        return BasicSweeper.split_arguments(list(overrides), None)[0]
     except HydraException as error:
         raise BcrlError(first_lines(error)) from error

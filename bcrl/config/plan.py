@@ -1,25 +1,19 @@
 """From a composed configuration to a plan: stages, transfers, variant, directory."""
 
-from __future__ import annotations
-
-import dataclasses
-import hashlib
-import json
-import math
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from bcrl.common import compiling, plugins
 from bcrl.common.checks import construct, one_of
-from bcrl.common.identity import Plain, differences, flat
+from bcrl.common.identity import Plain
 from bcrl.config.algorithms import algorithm
+from bcrl.config.rules import check_numbers
 from bcrl.config.schema import Choice, Config, check_name, check_path
 from bcrl.config.variant import Composition, composition
 from bcrl.envs import Env, check_tasks, tasks_of
-from bcrl.errors import ConfigError, at_least, did_you_mean
+from bcrl.errors import ConfigError, did_you_mean
 from bcrl.evaluation.metrics import check_metrics
 from bcrl.learning.stage import Stage
 from bcrl.learning.transfer import PolicyReuse, ResidualPolicy, Shape
@@ -72,34 +66,22 @@ class Plan:
         return sum(stage.learner.length for stage in self.stages)
 
 
-def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
-    """The checked plan of a resolved config; ConfigError says what can't be.
-
-    `known` maps a tag to the config of the same choice of groups without any value
-    overridden: None to the paper's reading, "released" to the authors' code's. Where
-    the config departs from all of them, its results get a separate directory, below
-    the name of the `env` choice.
-    """
+def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
+    """The checked plan of a resolved config; `env` and `tag` name its directory."""
     compiling.check()
-    _check_outputs(config)
+    _check_outputs(config, tag)
     check_name("env", env)
     tasks, metrics = _tasks(config["env"])
     section = config["algorithm"]
-    if not isinstance(section, dict):
-        raise ConfigError("algorithm", section, "must be a section with a name")
     name = str(section.get("name"))
     chosen_algorithm = algorithm(name)
     chosen = composition(config, tasks)
     stages = chosen_algorithm.stages(section, chosen)
-    chosen.check()  # an algorithm of the user's may have left it out
-    differing = {tag: differences(config, other) for tag, other in known.items()}
-    same = [tag for tag, changed in differing.items() if not changed]
-    tag = same[0] if same else _short_hash(differing[None])
     asked = _asked(config["seeds"])
     return Plan(
         env=env,
         variant=_variant(name, chosen),
-        tag=config["tag"] or tag,
+        tag=tag,
         family=chosen_algorithm.FAMILY,
         stages=stages,
         tasks=tuple(tasks),
@@ -110,6 +92,7 @@ def plan(config: Plain, known: Mapping[str | None, Plain], env: str) -> Plan:
         device=_device(config["device"], chosen_algorithm.FAMILY),
         config=config,
         sources=plugins.fingerprint(config),
+        **more,
     )
 
 
@@ -118,9 +101,9 @@ def _asked(section: Plain) -> tuple[int, ...]:
     listed = section.get("only")
     if section.get("count") is not None:
         return tuple(range(section["first"], section["first"] + section["count"]))
-    if not listed or len(set(listed)) < len(listed):
+    if not listed or len(set(listed)) < len(listed) or min(listed) < 0:
         raise ConfigError("seeds.only", listed, "must be different seeds: seeds=[3,7]")
-    if not (min(listed) >= 0 and max(listed) <= 2**32 and len(listed) <= 10**6):
+    if max(listed) > 2**32 or len(listed) > 10**6:
         raise ConfigError("seeds.only", listed, "must be from 0 to 2^32, at most 10^6")
     return tuple(sorted(listed))
 
@@ -166,47 +149,22 @@ def _device(wanted: str, family: str) -> str:
     return "cuda" if there else "cpu"
 
 
-def _short_hash(changed: Mapping[str, tuple[Any, Any]]) -> str:
-    values = {key: value for key, (value, _) in changed.items()}
-    text = json.dumps(values, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:8]
-
-
-#: Keys with a least value, and where it matters a greatest.
-_BOUNDS = {
-    "seeds.first": (0, 2**32),
-    "seeds.count": (1, 10**6),
-    "seeds.lockstep": (1, math.inf),
-    "workers": (1, math.inf),
-    "threads": (1, math.inf),
-    "scale.max_iterations": (1, math.inf),
-    "scale.max_episodes": (1, math.inf),
-    "scale.max_steps": (1, math.inf),
-}
-
-
-def _check_outputs(config: Plain) -> None:
+def _check_outputs(config: Plain, tag: str | None) -> None:
     """Raise ConfigError for what the keys outside of the groups can't be."""
-    known = [f.name for f in dataclasses.fields(Config)]
+    known = [f.name for f in fields(Config)]
     for key, value in config.items():
         if key not in known:
             raise ConfigError(key, value, f"unknown key; {did_you_mean(key, known)}")
     construct("curriculum", Choice, config["curriculum"])
-    values = flat(config)
-    for key, (least, most) in _BOUNDS.items():
-        value = values.get(key)
-        at_least(key, value, least)
-        if value is not None and value > most:
-            raise ConfigError(key, value, f"must be at most {most}")
-    if not 0 < config["checkpoint_every"] < math.inf:
-        why = "must be a number of seconds above 0"
-        raise ConfigError("checkpoint_every", config["checkpoint_every"], why)
+    for section in ("seeds", "scale", ""):
+        values = config[section] if section else config
+        check_numbers(section, {k: v for k, v in values.items() if v is not None})
     logger(config["logger"])
     one_of("progress", config["progress"], ["auto", "bar", "lines", "none"])
     check_path("runs_dir", config["runs_dir"])
-    for key in ("tag", "scale.name"):
-        if values.get(key) is not None:
-            check_name(key, values[key])
+    check_name("scale.name", config["scale"]["name"])
+    if tag is not None:
+        check_name("tag", tag)
 
 
 def _tasks(section: Plain) -> tuple[list[Env], tuple[str, ...]]:

@@ -1,7 +1,5 @@
 """A config is data: it runs no code, leads to no file outside and stays small."""
 
-from __future__ import annotations
-
 import copy
 import os
 import re
@@ -11,7 +9,6 @@ from typing import Any
 import yaml
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.config_search_path import ConfigSearchPath
-from hydra.errors import CompactHydraException
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
@@ -38,13 +35,7 @@ ALLOWED = re.compile(
     r"mode|sweeper\.params\b.*|launcher\b.*|searchpath|(runtime|overrides)\b.*"
     r"|job\.(override_dirname|config_name)"
 )
-
-
 _OURS: dict[str, ConfigResult] = {}
-
-
-class Rejected(BcrlError, CompactHydraException):
-    """Bad input that Hydra, too, reports without a traceback."""
 
 
 class ConfigFolder(FileConfigSource):
@@ -56,10 +47,10 @@ class ConfigFolder(FileConfigSource):
         return "bcrl"
 
     def load_config(self, config_path: str) -> ConfigResult:
-        """Read one file; Rejected says what is wrong with it."""
+        """Read one file; BcrlError says what is wrong with it."""
         name = os.path.normpath(self._normalize_file_name(config_path))
         if os.path.isabs(name) or name.startswith(".."):
-            raise Rejected(f"{config_path}: leads out of the folder {self.path}")
+            raise BcrlError(f"{config_path}: leads out of the folder {self.path}")
         if self.provider == "main":  # ours, which every job of a sweep reads
             place = os.path.join(self.path, name)
             if place not in _OURS:
@@ -72,7 +63,7 @@ class ConfigFolder(FileConfigSource):
             schema.check_written(package, loaded.config)
             if OmegaConf.select(loaded.config, "hydra.searchpath") is not None:
                 why = "only the command line names folders of configs: --config-dir"
-                raise Rejected(f"hydra.searchpath in {config_path}: {why}")
+                raise BcrlError(f"hydra.searchpath in {config_path}: {why}")
         return loaded
 
 
@@ -102,20 +93,18 @@ def check_override(text: str) -> None:
 
 
 def check_file(path: Path) -> None:
-    """Raise Rejected for a file that isn't plain, small YAML in UTF-8."""
+    """Raise BcrlError for a file that isn't plain, small YAML in UTF-8."""
     if not path.is_file():  # a pipe would never end
-        raise Rejected(f"{path} is no regular file")
+        raise BcrlError(f"{path} is no regular file")
     if path.stat().st_size > FILE_BYTES:
-        raise Rejected(f"{path} is larger than {FILE_BYTES // 1024} KiB")
+        raise BcrlError(f"{path} is larger than {FILE_BYTES // 1024} KiB")
     try:
         check_yaml(path.read_text("utf-8"))
-    except UnicodeDecodeError as error:
-        raise Rejected(f"{path} isn't UTF-8: {error.reason}") from error
-    except yaml.YAMLError as error:
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
         words = " ".join(str(error).split())
-        raise Rejected(f"{path} can't be read: {words}") from error
+        raise BcrlError(f"{path} can't be read: {words}") from error
     except BcrlError as error:
-        raise Rejected(f"{path} {error}") from error
+        raise BcrlError(f"{path} {error}") from error
 
 
 def check_yaml(text: str) -> None:
@@ -135,20 +124,17 @@ def check_yaml(text: str) -> None:
         if isinstance(event, yaml.ScalarEvent) and event.implicit[0]:
             word = event.value
             kind = resolver.resolve(yaml.ScalarNode, word, (True, False))[-5:]
-            if kind == ":bool" and word.lower() not in ("true", "false"):
-                why = "write true or false, or quote on and off where they are names"
-                raise BcrlError(f"has a bare {word}, a truth value to YAML; {why}")
-            if kind in ("2:int", "float") and re.search("[:_xb]|^[+-]?0[0-9]", word):
-                why = "write the number that is meant in digits, or quote a name"
-                read = yaml.safe_load(word)
-                raise BcrlError(f"has a bare {word}, which YAML reads as {read}; {why}")
+            odd = kind == ":bool" and word.lower() not in ("true", "false")
+            digits = kind in ("2:int", "float")
+            if odd or (digits and re.search("[:_xb]|^[+-]?0[0-9]", word)):
+                why = f"has a bare {word}, which YAML reads as {yaml.safe_load(word)}"
+                raise BcrlError(f"{why}; write what is meant, or quote it as a name")
 
 
 def check_composed(composed: DictConfig, usual: DictConfig | None) -> None:
     """Raise ConfigError for interpolations or keys of Hydra's that aren't allowed.
 
-    `usual` is a config with Hydra's keys at their defaults, or None where nobody could
-    have changed them.
+    `usual` has Hydra's keys at their defaults; None: nobody could have changed them.
     """
     config: Any = OmegaConf.to_container(composed, resolve=False)
     hydra = flat(config.pop("hydra"))

@@ -1,11 +1,8 @@
 """The configuration's schema, and checks that name key, value and what is allowed."""
 
-from __future__ import annotations
-
-import dataclasses
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, is_dataclass
 from functools import cache
 from pathlib import PurePath
 from typing import Any, get_args, get_type_hints
@@ -17,6 +14,9 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from bcrl.common.checks import construct
 from bcrl.common.identity import Plain, flat
 from bcrl.errors import ConfigError, at_least
+
+#: The choices that make a variant.
+VARIANT_GROUPS = ("env", "algorithm", "curriculum", "boosting", "transfer", "scale")
 
 
 @dataclass
@@ -90,11 +90,9 @@ def section_of_seeds(key: str, value: object) -> dict[str, Any]:
 def check_written(package: str, config: DictConfig) -> None:
     """Check what a file says of seeds and texts; `seeds: 5` becomes the section's keys.
 
-    Raises ConfigError for two ways of naming seeds, and for a number where text is
-    expected: `tag: 1e3`.
+    Raises ConfigError for seeds named twice, and for a number as text: `tag: 1e3`.
     """
-    place = "" if package == "_global_" else package.replace("/", ".") + "."
-    place = place.lstrip(".")
+    place = "" if package in ("", "_global_") else package.replace("/", ".") + "."
     if not place and None not in (config.get("seed"), config.get("seeds")):
         raise ConfigError("seed", config["seed"], "seeds is given, too; keep one")
     for key in ("seed", "seeds") if not place else ():
@@ -112,17 +110,14 @@ def check_written(package: str, config: DictConfig) -> None:
 def texts() -> frozenset[str]:
     """The keys that a schema declares as text, ours and those of Slurm's launcher."""
 
-    def of(cls: Any, prefix: str) -> set[str]:
-        hints = get_type_hints(cls)
-        own = {prefix + name for name, hint in hints.items() if _is_text(hint)}
-        inner = [(n, h) for n, h in hints.items() if dataclasses.is_dataclass(h)]
-        return own.union(*(of(hint, f"{prefix}{name}.") for name, hint in inner))
+    def of(cls: Any, prefix: str) -> Iterator[str]:
+        for name, hint in get_type_hints(cls).items():
+            if hint is str or get_args(hint) == (str, type(None)):
+                yield f"{prefix}{name}"
+            elif is_dataclass(hint):
+                yield from of(hint, f"{prefix}{name}.")
 
-    return frozenset(of(Config, "") | of(SlurmQueueConf, "hydra.launcher."))
-
-
-def _is_text(hint: Any) -> bool:
-    return hint is str or get_args(hint) == (str, type(None))
+    return frozenset({*of(Config, ""), *of(SlurmQueueConf, "hydra.launcher.")})
 
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{,99}")
@@ -136,10 +131,7 @@ class _Slurm(SlurmQueueConf):
 
 
 def check_launcher(values: Plain | None) -> None:
-    """Raise ConfigError for a launcher other than Slurm's, or a key that it can't take.
-
-    Its values end in a shell script, so no character of a shell is allowed.
-    """
+    """Raise ConfigError for a launcher other than Slurm's, or a value it can't take."""
     values = {k: v for k, v in (values or {}).items() if v not in (None, [], {})}
     if values == BASIC:
         return
@@ -149,16 +141,17 @@ def check_launcher(values: Plain | None) -> None:
         raise ConfigError("hydra.launcher._target_", values.get("_target_"), why)
     construct("hydra.launcher", _Slurm, values)
     for key, value in values.items():
-        name = f"hydra.launcher.{key}"
+        name, why = f"hydra.launcher.{key}", ""
         if key in ("setup", "additional_parameters"):
-            raise ConfigError(name, value, "runs commands; leave it out")
+            why = "runs commands; leave it out"
+        elif not re.fullmatch(r"[^\n\r;`()<>|&$]*", str(value)):
+            why = "has characters of a shell"
+        elif key.startswith("mem_per") and not re.fullmatch(r"\d+[KMGT]?B?", value):
+            why = "must be a size such as 2G or 800M"
+        if why:  # the values end in a shell script
+            raise ConfigError(name, value, why)
         if type(value) is int:
-            zero = key in ("max_num_timeout", "signal_delay_s")
-            at_least(name, value, 0 if zero else 1)
-        if not re.fullmatch(r"[^\n\r;`()<>|&$]*", str(value)):
-            raise ConfigError(name, value, "has characters of a shell")
-        if key.startswith("mem_per") and not re.fullmatch(r"\d+[KMGT]?B?", value):
-            raise ConfigError(name, value, "must be a size such as 2G or 800M")
+            at_least(name, value, key not in ("max_num_timeout", "signal_delay_s"))
         if key == "submitit_folder":
             check_path(name, value)
     delay, limit = (values.get(key, 0) for key in ("signal_delay_s", "timeout_min"))

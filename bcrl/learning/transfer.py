@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 from bcrl.common.serialization import storable
 from bcrl.errors import ConfigError, at_least
@@ -35,8 +35,8 @@ class Boost:
     The defaults are the paper's; the released BC-DQN has residual, two and false.
     """
 
-    greedy_on: str = "sum"
-    maxima: str = "one"
+    greedy_on: Literal["sum", "residual"] = "sum"
+    maxima: Literal["one", "two"] = "one"
     mask_at_goal: bool = True
 
     def __call__(self, start: StageInit, previous: StageResult) -> StageInit:
@@ -52,7 +52,7 @@ class Shape:
     before_reset and false.
     """
 
-    next_state: str = "stored"
+    next_state: Literal["stored", "before_reset"] = "stored"
     zero_at_goal: bool = True
 
     def __call__(self, start: StageInit, previous: StageResult) -> StageInit:

@@ -7,12 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import yaml
 
 from bcrl import api
 from bcrl.config import jobs
 from bcrl.config import plan as compose
-from bcrl.config.hydra_compose import CONF, CONFIG_NAME, composed
+from bcrl.config.hydra_compose import composed, read_option
+from bcrl.config.hydra_compose import options as names
 from bcrl.errors import ConfigError
 from bcrl.learning.curriculum import CURRICULA
 from bcrl.learning.lspi import LSPI
@@ -35,8 +35,7 @@ from tests.toys import OpenCorridor
 
 def options(group: str) -> dict[str, dict]:
     """The options of a group, by name, as their files say."""
-    paths = sorted((CONF / group).glob("*.yaml"))
-    return {path.stem: yaml.safe_load(path.read_text()) for path in paths}
+    return {name: read_option(group, name) for name in names(group)}
 
 
 #: The choices besides env and algorithm; an option added to conf/ is covered, too.
@@ -53,9 +52,7 @@ OWN = {
 def settled(env: str, algorithm: str) -> dict:
     """A composed config of the pair, resolved."""
     named = ("env.id=CartPole-v1",) if env == jobs.OPEN else ()
-    return jobs._plain(
-        composed(CONFIG_NAME, (f"env={env}", f"algorithm={algorithm}", *named), ())
-    )
+    return jobs._plain(composed((f"env={env}", f"algorithm={algorithm}", *named)))
 
 
 def outcome(make, *arguments, **options):
@@ -68,7 +65,7 @@ def outcome(make, *arguments, **options):
 
 def by_command(config: dict):
     """What the command line makes of a composed config."""
-    return compose.plan(config, {None: config}, "env").stages
+    return compose.plan(config, "env").stages
 
 
 def by_api(config: dict):
@@ -79,55 +76,29 @@ def by_api(config: dict):
         values = dict(config[group])
         if cls := classes.get(values.pop("name")):
             transfers.append(cls(**values))
-    section = config["algorithm"]
-    learners = {"fqi": fqi, "dqn": dqn}[section["name"]](
-        section, config["curriculum"]["name"], tasks, transfers
-    )
-    return api.stages(
-        tasks, learners, *transfers, curriculum=config["curriculum"]["name"]
-    )
-
-
-def per_slot(value, n):
-    return value if isinstance(value, list) else [value] * n
-
-
-def fqi(section, curriculum, tasks, transfers):
-    values, n = dict(section["regressor"]), len(tasks)
-    regressor = REGRESSORS[values.pop("name")](**values)
-    budgets = (section[key] for key in ("iterations", "episodes", "epsilon"))
-    return [
-        api.FQI(
-            iterations,
-            episodes,
-            regressor,
-            float(epsilon),
-            section["new_data"] == "stage",
-            section["dataset"] == "shared",
-            section["fit_randomness"] == "fixed",
-        )
-        for iterations, episodes, epsilon in zip(
-            *(per_slot(b, n) for b in budgets), strict=True
-        )
-    ]
-
-
-def dqn(section, curriculum, tasks, transfers):
-    values, n = {k: per_slot(v, len(tasks)) for k, v in section.items()}, len(tasks)
-    made = []
-    for slot, task in enumerate(CURRICULA[curriculum](n)):
-        kind, own = values["learners"][slot], section["lspi"]
-        if kind == "auto":
-            quadratic = getattr(tasks[task], "linear_quadratic", None) is not None
-            kind = "lspi" if quadratic and transfers and slot == 0 else "dqn"
-        if kind == "lspi":
-            steps, tested = (values[k][slot] for k in ("steps", "evaluation_episodes"))
-            made.append(LSPI(steps=steps, evaluation_episodes=tested, **own))
+    section, curriculum = config["algorithm"], config["curriculum"]["name"]
+    n, learners, auto = len(tasks), [], "dqn"
+    if section["name"] == "dqn" and transfers:
+        first = tasks[CURRICULA[curriculum](n)[0]]
+        auto = "dqn" if getattr(first, "linear_quadratic", None) is None else "lspi"
+    for slot in range(n):
+        own = section | {"hidden": tuple(section.get("hidden", ()))}
+        own = {k: v[slot] if isinstance(v, list) else v for k, v in own.items()}
+        kind, hidden = own.pop("learners", None), own.pop("hidden")
+        if own.pop("name") == "fqi":
+            values = dict(own.pop("regressor"))
+            regressor = REGRESSORS[values.pop("name")](**values)
+            own["new_data"] = own["new_data"] == "stage"
+            own["shared_data"] = own.pop("dataset") == "shared"
+            own["fixed_trees"] = own.pop("fit_randomness") == "fixed"
+            learners.append(api.FQI(regressor=regressor, **own))
+        elif kind == "lspi" or (kind == "auto" and slot == 0 and auto == "lspi"):
+            budget = {k: own[k] for k in ("steps", "evaluation_episodes")}
+            learners.append(LSPI(**budget, **own["lspi"]))
         else:
-            left_out = ("name", "learners", "lspi", "hidden")
-            each = {k: v[slot] for k, v in values.items() if k not in left_out}
-            made.append(api.DQN(**each, hidden=tuple(section["hidden"])))
-    return made
+            del own["lspi"]
+            learners.append(api.DQN(hidden=hidden, **own))
+    return api.stages(tasks, learners, *transfers, curriculum=curriculum)
 
 
 @pytest.mark.parametrize("algorithm", options("algorithm"))
@@ -161,7 +132,7 @@ def test_an_order_of_ones_own_is_the_same_in_both(algorithm, monkeypatch):
         config = settled("car_on_hill", algorithm) | chosen
         assert outcome(by_command, config) == outcome(by_api, config)
         if len(order) == 3:
-            made = compose.plan(config, {None: config}, "car_on_hill")
+            made = compose.plan(config, "car_on_hill")
             named = "C-" in made.variant or "SC" in made.variant
             assert named == (len(set(order)) > 1)
 
@@ -219,77 +190,56 @@ def test_data_are_kept_within_a_task_only():
     assert api.stages([TASKS[0], *TASKS[-1:] * 2], [FITTED, *[learners[2]] * 2])
 
 
-def test_the_order_of_transfers_makes_no_difference():
-    one, other = (api.stages(TASKS, FITTED, *t) for t in ((SHAPE, B), (B, SHAPE)))
-    assert one == other and one[0].transfers == (B, SHAPE)
-
-
 B, SHAPE, RPL, PPR = Boost(), Shape(), ResidualPolicy(), PolicyReuse()
 LEARNED = StageResult(ZERO, ZERO)
 DEEP, LINEAR = api.DQN(), [api.LinearSystem("lq", horizon=100), api.LinearSystem()]
 REUSED = [replace(LINEAR[0], horizon=100)] * 2
-REJECTED = {
-    "nothing to reuse": (LINEAR[1:] * 2, DEEP, (PPR,), "transfer"),
-    "nothing to add to": (LINEAR[1:] * 2, DEEP, (RPL,), "transfer"),
-    "two meanings of an action": (LINEAR, DEEP, (B, RPL), "transfer"),
-    "no vectors": (TASKS, DEEP, (RPL,), "transfer"),
-    "one stage": (TASKS[:1], DEEP, (SHAPE,), "transfer"),
-    "one boosted stage": (TASKS[:1], FITTED, (B,), "boosting"),
-    "boosted twice": (TASKS, FITTED, (B, B), "transfers"),
-    "two at once": (LINEAR, DEEP, (SHAPE, PPR), "transfers"),
-    "a warm start besides": (TASKS, FITTED, (warm_start, B), "transfers"),
-    "no transfer": (TASKS, FITTED, ("boost",), "transfers"),
-    "no table": (TASKS, replace(FITTED, regressor=api.Tabular()), (), "regressor"),
-    "fit of released DQN": (TASKS, FITTED, (Boost(maxima="two"),), "boosting"),
-    "two families": (TASKS, [FITTED, DEEP, DEEP], (), "learners"),
-    "a class": (TASKS, api.DQN, (), "learners"),
-    "data for all seeds": (
-        TASKS,
-        replace(FITTED, shared_data=True, epsilon=0.5),
-        (),
-        "dataset",
-    ),
-    "no iterations": (TASKS, replace(FITTED, iterations=0), (), "iterations"),
-    "half an episode": (TASKS, replace(FITTED, episodes=0.5), (), "episodes"),
-    "a boolean": (TASKS, replace(FITTED, episodes=True), (), "episodes"),
-    "epsilon": (TASKS, replace(DEEP, epsilon=1.5), (), "epsilon"),
-    "no rate": (TASKS, replace(DEEP, learning_rate=0.0), (), "learning_rate"),
-    "no layer": (TASKS, replace(DEEP, hidden=()), (), "hidden"),
-    "small replay": (TASKS, replace(DEEP, replay_size=16), (), "replay_size"),
-    "never learns": (TASKS, replace(DEEP, learning_starts=10_000), (), "replay_size"),
-    "another network": (
-        TASKS[:2],
-        [DEEP, replace(DEEP, hidden=(8,))],
-        (),
-        "hidden",
-    ),
-    "another regressor": (
-        TASKS[:2],
-        [FITTED, replace(FITTED, regressor=api.Forest(trees=3))],
-        (),
-        "regressor",
-    ),
-    "LSPI not linear": (LINEAR, LSPI(), (B,), "learners"),
-    "LSPI without a network": (LINEAR, [LSPI(), DEEP], (), "learners"),
-    "LSPI twice": (REUSED, LSPI(), (B,), "learners"),
-    "LSPI last": (LINEAR[::-1], [DEEP, LSPI()], (SHAPE,), "learners"),
-    "LSPI's steps": (LINEAR, [LSPI(steps=2100), DEEP], (B,), "steps"),
-    "LSPI's features": (LINEAR, [LSPI(features="cubic"), DEEP], (B,), "lspi.features"),
-    "LSPI's noise": (LINEAR, [LSPI(noise_std=0.0), DEEP], (B,), "lspi.noise_std"),
-}
+SHARED, OTHER = replace(FITTED, shared_data=True, epsilon=0.5), api.Forest(trees=3)
+#: Tasks, learners, transfers, and the key that is rejected; numbers out of bounds stand
+#: in bad_input.txt.
+REJECTED = [
+    (LINEAR[1:] * 2, DEEP, (PPR,), "transfer"),  # nothing to reuse
+    (LINEAR[1:] * 2, DEEP, (RPL,), "transfer"),  # nothing to add to
+    (LINEAR, DEEP, (B, RPL), "transfer"),  # two meanings of an action
+    (TASKS, DEEP, (RPL,), "transfer"),  # no vectors
+    (TASKS[:1], DEEP, (SHAPE,), "transfer"),
+    (TASKS[:1], FITTED, (B,), "boosting"),
+    (TASKS, FITTED, (B, B), "transfers"),
+    (LINEAR, DEEP, (SHAPE, PPR), "transfers"),
+    (TASKS, FITTED, (warm_start, B), "transfers"),
+    (TASKS, FITTED, ("boost",), "transfers"),
+    (TASKS, replace(FITTED, regressor=api.Tabular()), (), "regressor"),
+    (TASKS, FITTED, (Boost(maxima="two"),), "boosting"),
+    (TASKS, [FITTED, DEEP, DEEP], (), "learners"),
+    (TASKS, api.DQN, (), "learners"),
+    (TASKS, SHARED, (), "dataset"),
+    (TASKS, replace(FITTED, episodes=0.5), (), "episodes"),
+    (TASKS, replace(FITTED, episodes=True), (), "episodes"),
+    (TASKS, replace(DEEP, hidden=()), (), "hidden"),
+    (TASKS[:2], [DEEP, replace(DEEP, hidden=(8,))], (), "hidden"),
+    (TASKS[:2], [FITTED, replace(FITTED, regressor=OTHER)], (), "regressor"),
+    (LINEAR, LSPI(), (B,), "learners"),  # not linear-quadratic
+    (LINEAR, [LSPI(), DEEP], (), "learners"),  # leaves no network
+    (REUSED, LSPI(), (B,), "learners"),  # twice
+    (LINEAR[::-1], [DEEP, LSPI()], (SHAPE,), "learners"),  # last
+    (LINEAR, [LSPI(steps=2100), DEEP], (B,), "steps"),
+    (LINEAR, [LSPI(features="cubic"), DEEP], (B,), "lspi.features"),
+    (LINEAR, [LSPI(noise_std=0.0), DEEP], (B,), "lspi.noise_std"),
+]
 
 
-@pytest.mark.parametrize("case", REJECTED)
-def test_a_script_is_rejected_what_makes_no_sense(case):
-    tasks, learners, transfers, key = REJECTED[case]
+@pytest.mark.parametrize(("tasks", "learners", "transfers", "key"), REJECTED)
+def test_a_script_is_rejected_what_makes_no_sense(tasks, learners, transfers, key):
     with pytest.raises(ConfigError) as rejection:
         api.stages(tasks, learners, *transfers)
     assert rejection.value.key == key
 
 
-def test_numbers_of_numpy_are_numbers():
+def test_numbers_of_numpy_are_numbers_and_the_order_of_transfers_is_free():
     given = replace(FITTED, episodes=np.int64(3), epsilon=np.float64(0.5))
     assert len(api.stages(TASKS, given)) == 3
+    one, other = (api.stages(TASKS, FITTED, *t) for t in ((SHAPE, B), (B, SHAPE)))
+    assert one == other and one[0].transfers == (B, SHAPE)
 
 
 def test_one_of_several_lspi_stages_would_forget_the_others():
@@ -351,9 +301,9 @@ def test_a_transfer_of_ones_own_has_an_effect_on_its_learner(
 
 
 def test_a_transfer_of_ones_own_that_acts_needs_no_random_steps():
-    for what, random in (("base", 0), ("steering", 0), ("weights", 0)):
+    for what in ("base", "steering", "weights"):
         stages = api.stages(TASKS, DEEP, Own(what))
-        assert [s.learner.random_steps for s in stages] == [500, random, random]
+        assert [s.learner.random_steps for s in stages] == [500, 0, 0]
     shaped = api.stages(TASKS, DEEP, SHAPE)
     assert {s.learner.random_steps for s in shaped} == {500}
 

@@ -1,6 +1,5 @@
 """A config can't run code, leave its folder or grow without end."""
 
-import ast
 import os
 import re
 import sys
@@ -15,10 +14,10 @@ from bcrl.common import plugins
 from bcrl.config import flags, jobs, safety, schema
 from bcrl.errors import BcrlError
 from bcrl.run import runner
+from tests.config.helpers import own, rows
 from tests.conftest import plan, plans
 
 MAZE = "env=maze"
-CALL = "{_target_: os.system, command: touch canary}"
 SLURM = "hydra/launcher=slurm"
 
 
@@ -29,64 +28,16 @@ def rejected(*overrides: str, **options) -> str:
     return str(error.value)
 
 
-def own(folder: Path, text: str, place: str = "experiment/mine") -> str:
-    """Writes a user's config and returns its folder."""
-    path = folder / "own" / f"{place}.yaml"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    head = "# @package _global_\n" if place.startswith("experiment") else ""
-    path.write_text(head + textwrap.dedent(text))
-    return str(folder / "own")
-
-
 #: By kind: overrides, each of which is rejected, with the key or value that is named.
 BAD = {
-    "instantiates": {
-        f"+hydra.callbacks.x={CALL}": "hydra.callbacks.x._target_=os.system",
-        "hydra.launcher._target_=os.system": "hydra.launcher._target_=os.system",
-        "hydra.launcher=null": "hydra.launcher",
-        f"+hydra.launcher.x={CALL}": "hydra.launcher",
-        "hydra.sweeper._target_=posix.system": "hydra.sweeper._target_=posix.system",
-        "~hydra.sweeper._target_": "hydra.sweeper._target_",
-        f"+env.x={CALL}": "env.x",
-        f"+env.x=[[{CALL}]]": "env.x",
-        f"+x={CALL}": "x",
-        "+env._convert_=all": "env._convert_",
-    },
-    "Hydra's other keys": {
-        "hydra/job_logging=default": "hydra.job_logging",
-        "+hydra.hydra_logging.filters={x: {name: y}}": "hydra.hydra_logging.filters",
-        "hydra.job.chdir=true": "hydra.job.chdir=True",
-        "+hydra.job.env_set.LD_PRELOAD=evil.so": "hydra.job.env_set.LD_PRELOAD",
-        "hydra.job.env_copy=[PATH]": "hydra.job.env_copy",
-        "hydra.job.name=../x": "hydra.job.name=../x",
-        "hydra.run.dir=../x": "hydra.run.dir=../x",
-        "hydra.sweep.dir=../x": "hydra.sweep.dir",
-        "hydra.output_subdir=conf": "hydra.output_subdir=conf",
-        "hydra.verbose=true": "hydra.verbose",
-        "hydra.searchpath=[pkg://antigravity]": "pkg:",
-    },
-    "interpolations": {
-        "tag='${oc.create:{_target_: os.system}}'": "tag=",
-        "tag='${oc.decode:${oc.env:X}}'": "tag=",
-        "tag='${${tag}:x}'": "tag=",
-        "tag='${oc.select:runs_dir}'": "tag=",
-        "tag='j${hydra:job.num}'": "tag=j",
-        "tag=${hydra.job.name}": "tag=",
-        "+env.x=${env}": "env.x",
+    "harmful": dict(rows("harmful.txt")),
+    "long": {
         "tag=" + "${device}" * 17: "tag=",
-    },
-    "paths": {
-        "runs_dir='~/x'": "runs_dir=~/x",
-        "runs_dir=~/x": "runs_dir=$HOME/x",
-        "runs_dir=file://x": "runs_dir=",
         "runs_dir='a\nb'": "runs_dir=",
         "runs_dir=" + "x" * 300: "runs_dir=",
         "runs_dir=" + "x/" * 1500: "runs_dir=",
         "tag=" + "x" * 300: "tag=",
-        "experiment=../../x": "experiment",
         "tag=a\udcff": "UTF-8",
-    },
-    "size": {
         "tag=" + "[" * 2000: "brackets",
         "+x=" + "{a:" * 2000: "brackets",
         "+" + "a." * 3000 + "a=1": "nested",
@@ -94,11 +45,10 @@ BAD = {
         "seeds.count=999999999999": "seeds.count=999999999999",
         "seeds.first=1" + "0" * 5000: "seeds.first",
     },
-    "sweeps": {
-        "seeds.first=range(0,1000000000)": "seeds.first",
-        "seeds.first=range(0,inf)": "seeds.first",
-        "seeds.first=range(5,5)": "seeds.first",
-    },
+    "sweeps": dict.fromkeys(
+        (f"seeds.first=range({r})" for r in ("0,1000000000", "0,inf", "5,5")),
+        "seeds.first",
+    ),
 }
 
 
@@ -110,23 +60,24 @@ def test_what_could_do_harm_is_rejected_by_key_and_value(kind, tmp_path, monkeyp
     assert not list(tmp_path.iterdir())
 
 
-def test_what_is_given_twice_or_in_a_cycle_is_rejected():
-    twice = (f"+hydra.callbacks={{x: {CALL}}}", "+hydra.callbacks={y: null}")
-    assert "given twice" in rejected(MAZE, *twice)
-    assert "device" in rejected(MAZE, "tag=${device}", "device=${tag}")
-    assert "jobs" in rejected(
-        MAZE, *(f"+{k}=range(0,100)" for k in "ab"), multirun=True
-    )
+def test_a_sweep_of_more_jobs_than_anyone_means_is_rejected():
+    both = (f"+{k}=range(0,100)" for k in "ab")
+    assert "jobs" in rejected(MAZE, *both, multirun=True)
 
 
 @pytest.mark.parametrize(
     "target",
     [
-        *("os.system", "subprocess.run", "builtins.eval", "hydra.utils.instantiate"),
-        *("functools.partial", "bcrl.run.runner.run", "torch.load", "os", "", None),
+        *(
+            "os.system",
+            "hydra.utils.instantiate",
+            "bcrl.run.runner.run",
+            "os",
+            "",
+            None,
+        ),
         "hydra_plugins.hydra_submitit_launcher.submitit_launcher.LocalLauncher",
         "hydra_plugins.hydra_joblib_launcher.joblib_launcher.JoblibLauncher",
-        "hydra.experimental.callbacks.PickleJobInfoCallback",
     ],
 )
 def test_no_launcher_but_slurms_is_instantiated(target):
@@ -157,7 +108,6 @@ def test_the_launchers_section_of_a_command_line_is_checked():
     assert all(made.launched for made in plans(MAZE, SLURM, multirun=True))
     error = rejected(MAZE, SLURM, "hydra.launcher.timeout_min=0", multirun=True)
     assert "hydra.launcher.timeout_min=0" in error
-    assert "add -m" in rejected(MAZE, SLURM)
     assert "workers=2" in rejected(MAZE, "hydra/launcher=joblib", multirun=True)
 
 
@@ -176,22 +126,6 @@ def bomb(levels: int = 30) -> str:
     return "\n".join(lines) + "\n"
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "tag: !!python/object/apply:os.system ['touch canary']",
-        "tag: !!python/name:os.system",
-        *("tag: !!binary aGk=", "tag: !mine x", bomb()),
-        *("a: " + "[" * 3000 + "]" * 3000, "a: [" + "1," * 100_000 + "1]"),
-        *("horizon: 5:00", "first: 010", "first: 0x10", "only: [1_0]", "strict: yes"),
-        *("transfer: off", "a: [on]"),
-    ],
-)
-def test_yaml_that_makes_objects_grows_or_misleads_is_not_read(text):
-    with pytest.raises((BcrlError, safety.yaml.YAMLError)):
-        safety.check_yaml(text)
-
-
 def test_ordinary_yaml_is_read():
     safety.check_yaml("a: &a {x: [1, 2]}\nb: *a\nc: {<<: *a, y: !!str 3}\n")
     safety.check_yaml("a: [0, -1.5, 1e-4, 1.0e+3, .5, true, 'off', '010', a_b, 4.0]")
@@ -199,6 +133,12 @@ def test_ordinary_yaml_is_read():
 
 GROWTH = "\n".join(f"    a{i + 1}: ${{.a{i}}}${{.a{i}}}" for i in range(60))
 YAMLS = {
+    "an object": "tag: !!python/object/apply:os.system ['touch canary']",
+    "a name of code": "tag: !!python/name:os.system",
+    "bytes": "tag: !!binary aGk=",
+    "a tag of one's own": "tag: !mine x",
+    "nested": "a: " + "[" * 3000 + "]" * 3000,
+    "long": "a: [" + "1," * 100_000 + "1]",
     "a launcher": "hydra: {launcher: {_target_: os.system}}",
     "a callback": "hydra: {callbacks: {x: {_target_: os.system, command: touch x}}}",
     "a factory": "hydra: {job_logging: {handlers: {x: {(): os.system}}}}",
@@ -235,9 +175,7 @@ def test_a_file_that_is_not_utf8_or_leads_in_circles_is_rejected(tmp_path):
     folder = own(tmp_path, "tag: x")
     place = tmp_path / "own" / "experiment"
     (place / "mine.yaml").write_bytes(b"# @package _global_\ntag: '\xff\xfe'\n")
-    assert "mine.yaml isn't UTF-8" in rejected(
-        MAZE, "experiment=mine", config_dir=folder
-    )
+    assert "mine.yaml can't" in rejected(MAZE, "experiment=mine", config_dir=folder)
     (place / "self.yaml").symlink_to(place / "self.yaml")
     os.mkfifo(place / "pipe.yaml")
     for name in ("self", "pipe"):
@@ -338,11 +276,8 @@ def test_a_folder_that_is_named_may_name_code_and_a_config_alone_may_not(
 
 def test_tasks_name_code_as_the_environment_does():
     tasks = {"observation": ["zoo.a", None], "wrappers": [[{"name": "zoo.W"}], []]}
-    found = list(plugins.named_code({"env": {"name": "gymnasium", "tasks": tasks}}))
-    assert found == [
-        ("env.tasks.observation", "zoo.a"),
-        ("env.tasks.wrappers", "zoo.W"),
-    ]
+    found = dict(plugins.named_code({"env": {"name": "gymnasium", "tasks": tasks}}))
+    assert found == {"env.tasks.observation": "zoo.a", "env.tasks.wrappers": "zoo.W"}
 
 
 def test_the_sources_of_code_that_was_named_are_known(folder, tmp_path):
@@ -368,18 +303,10 @@ def test_what_a_module_lacks_is_said(folder, override, words):
 
 
 def test_nothing_that_is_read_as_data_can_be_a_pickle():
-    banned = {"pickle", "cPickle", "dill", "cloudpickle", "shelve", "marshal", "joblib"}
+    modules = "pickle|cPickle|dill|cloudpickle|shelve|marshal|joblib"
+    banned = rf"^\s*(import|from) ({modules})\b|(?<![\w.])(eval|exec|__import__)\("
     for path in Path(bcrl.__file__).parent.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Import):
-                assert not banned & {a.name.split(".")[0] for a in node.names}, path
-            elif isinstance(node, ast.ImportFrom):
-                assert (node.module or "").split(".")[0] not in banned, path
-            elif isinstance(node, ast.Call):
-                called = ast.unparse(node.func)
-                words = ast.unparse(node)
-                assert called not in ("eval", "exec", "yaml.load", "__import__"), path
-                if called in ("np.load", "numpy.load"):
-                    assert "allow_pickle=False" in words, path
-                if called == "torch.load":
-                    assert "weights_only=True" in words, path
+        text = path.read_text()
+        assert not re.search(rf"{banned}|yaml\.load\(", text, re.M), path
+        for call in re.findall(r"(?:np|numpy|torch)\.load\([^\n]*", text):
+            assert re.search("allow_pickle=False|weights_only=True", call), path

@@ -109,7 +109,7 @@ SENSELESS = {
     "0 tasks": ([], LEARNER),
     "there are 2 learners": (HERE, [LEARNER] * 2),
     r"write Boost\(\)": (HERE, LEARNER, Boost),
-    "FQI learns from whole": (HERE, LEARNER, ResidualPolicy()),
+    "one task": (HERE, LEARNER, ResidualPolicy()),
     "is no regressor": (HERE, FQI(1, 1, Tabular)),
     r"Sklearn\(estimator\)": (HERE, FQI(1, 1, KNeighborsRegressor())),
     "learners": (HERE, "FQI"),

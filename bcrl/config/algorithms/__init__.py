@@ -1,7 +1,5 @@
 """Algorithms: from a YAML of the group `algorithm` to the stages of a run."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from collections.abc import Collection
@@ -31,16 +29,10 @@ def algorithm(name: str) -> ModuleType:
 
 
 def per_slot(section: Plain, keys: Collection[str], n: int) -> list[dict[str, Any]]:
-    """A section's values in each of n slots; those of `keys` may be lists.
-
-    Raises ConfigError for a list whose length isn't n.
-    """
+    """A section's values in each of n slots; those of `keys` may be lists, n long."""
     lists = {k: v for k, v in section.items() if k in keys and isinstance(v, list)}
     for key, values in lists.items():
         if len(values) != n:
             why = f"has {len(values)} entries, but there are {n} tasks"
             raise ConfigError(f"algorithm.{key}", values, why)
-    return [
-        section | {key: values[slot] for key, values in lists.items()}
-        for slot in range(n)
-    ]
+    return [section | {k: v[slot] for k, v in lists.items()} for slot in range(n)]

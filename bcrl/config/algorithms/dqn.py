@@ -1,7 +1,5 @@
 """DQN's settings, and the stages they make, LSPI's pretraining among them."""
 
-from __future__ import annotations
-
 from bcrl.common.checks import construct, one_of
 from bcrl.common.identity import Plain
 from bcrl.config.algorithms import per_slot

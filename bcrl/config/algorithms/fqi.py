@@ -1,8 +1,6 @@
 """FQI's settings, and the stages they make: one per task slot."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 from bcrl.common.checks import construct
@@ -51,7 +49,5 @@ def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
                 fixed_trees=own.fit_randomness == "fixed",
             )
         )
-    name = {"algorithm.regressor": own.regressor.get("name")}
-    made = course(replace(chosen, written={**chosen.written, **name}), learners)
     caps = {key: chosen.scale[f"max_{key}"] for key in ("iterations", "episodes")}
-    return capped(made, FQI, **caps)
+    return capped(course(chosen, learners), FQI, **caps)
