@@ -13,9 +13,6 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import hydra
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
 
 from bcrl.common.files import make_directory
 from bcrl.common.signals import EXIT_CODE, Interrupted, heard
@@ -39,39 +36,42 @@ def main() -> None:
             if not sys.argv[1:]:
                 show(flags.short())
                 sys.exit(2)
-            plans = _planned(flags.arguments())
-            if plans:
-                make_directory(plans[0].root, "runs_dir")
+            asked = flags.arguments()
+            plans = [] if _shown(asked) else _planned(asked)
         if plans:
             from bcrl.run import runner
 
             heard()
             runner.run(*plans)
     except BcrlError as error:
-        sys.exit(_complain(error))
+        say(f"bcrl: {error}")
+        sys.exit(error.exit_code)
     except (Interrupted, KeyboardInterrupt):
         say("bcrl: interrupted; run the same command again to resume")
         sys.exit(EXIT_CODE)
 
 
-def _planned(asked: Namespace) -> list[Plan]:
-    """The plans to run here; none if something is shown, or Slurm has run them."""
+def _shown(asked: Namespace) -> bool:
+    """Whether a flag asks for something that is shown without a plan, and is shown."""
     if asked.experimental_rerun:
         raise BcrlError("--experimental-rerun: unpickles a file, which isn't supported")
     if asked.config_path:
         raise BcrlError("--config-path: add your folder with --config-dir")
     if asked.help:
         show(flags.manual(asked.config_dir))
-        return []
-    if asked.describe is not None:
+    elif asked.describe is not None:
         show(describe(asked.describe))
-        return []
-    if asked.shell_completion and any(o[:6] == "query=" for o in asked.overrides):
+    elif asked.shell_completion and any(o[:6] == "query=" for o in asked.overrides):
         show("\n".join(flags.completions(os.environ.get("COMP_LINE", ""))))
-        return []
-    if asked.hydra_help or asked.shell_completion:
-        _by_hydra(asked)
-        return []
+    elif asked.hydra_help or asked.shell_completion:
+        _show_by_hydra(asked)
+    else:
+        return False
+    return True
+
+
+def _planned(asked: Namespace) -> list[Plan]:
+    """The plans to run here; none if something is shown, or Slurm has run them."""
     from bcrl.config import jobs
     from bcrl.run import records, status
 
@@ -80,49 +80,32 @@ def _planned(asked: Namespace) -> list[Plan]:
         return []
     plans = jobs.plans(asked)
     if asked.cfg or asked.info:
-        _by_hydra(asked)
+        _show_by_hydra(asked)
         return []
     for plan in plans:
         records.check_directory(plan)
     if asked.dry_run:
         show(status.dry_run(plans))
         return []
-    if plans[0].launched:
-        from bcrl.run import launchers, runner
+    make_directory(plans[0].root, "runs_dir")
+    if plans[0].launcher:
+        from bcrl.run import launchers
 
-        launchers.register_slurm()
         heard()
-        _by_hydra(asked)
-        runner.check_complete(plans)
+        launchers.launch(plans)
         return []
     return plans
 
 
-def _run_job(composed: DictConfig) -> int:
-    """One job of Slurm's; its exit code.
-
-    An error is reported and no more: other jobs continue, and their files show it.
-    """
-    from bcrl.config import jobs
-    from bcrl.run import runner
-
-    GlobalHydra.instance().clear()  # Hydra has composed; here it composes to compare
-    try:
-        runner.run(jobs.plan_of_job(composed, HydraConfig.get()))
-    except BcrlError as error:
-        return _complain(error)
-    return 0
-
-
-def _by_hydra(asked: Namespace) -> None:
-    """Have Hydra show something, or launch jobs."""
+def _show_by_hydra(asked: Namespace) -> None:
+    """Have Hydra show something: a config, its own help, a script for the shell."""
     register_plugins()
     folders = searchpath(getattr(asked, "folders", ()))
     sys.argv[1:] = [*flags.for_hydra(asked), *asked.overrides, *folders]
-    # Not a decorator: a launcher's process looks for the plain function by its name.
-    hydra.main(version_base="1.3", config_path=str(CONF), config_name=CONFIG_NAME)(
-        _run_job
-    )()
+    shows = hydra.main(
+        version_base="1.3", config_path=str(CONF), config_name=CONFIG_NAME
+    )
+    shows(lambda _: None)()
 
 
 @contextmanager
@@ -137,8 +120,6 @@ def _one_message() -> Iterator[None]:
     except Exception as error:
         if before == "1":
             raise
-        if isinstance(error.__cause__, BcrlError):  # as in what Hydra instantiates
-            raise error.__cause__ from None
         words = " ".join(str(error).split()) or "no further words"
         why = f"{type(error).__name__}: {words}; {FULL_ERROR}=1 shows where"
         raise BcrlError(why) from error
@@ -147,12 +128,5 @@ def _one_message() -> Iterator[None]:
         os.environ.update({} if before is None else {FULL_ERROR: before})
 
 
-def _complain(error: BcrlError) -> int:
-    say(f"bcrl: {error}")
-    return error.exit_code
-
-
 if __name__ == "__main__":
-    from bcrl.cli import main as command  # `_run_job` has to be found by its name
-
-    command()
+    main()

@@ -27,7 +27,6 @@ from bcrl.config.hydra_compose import (
     options,
     plain,
     read_option,
-    register_plugins,
 )
 from bcrl.config.overrides import experiments, over_experiments, parse, product
 from bcrl.config.plan import Plan
@@ -86,18 +85,6 @@ def plans(arguments: Namespace) -> list[Plan]:
     made = [_plan(job, job.hydra, folders, None if own else overrides) for job in found]
     _check_directories(made)
     return made
-
-
-def plan_of_job(config: DictConfig, hydra: DictConfig) -> Plan:
-    """The plan of a job that a launcher runs, given Hydra's part of its config.
-
-    The command that launched it has checked the config.
-    """
-    register_plugins()
-    scheme = safety.ConfigFolder.scheme()
-    folders = [s.path for s in hydra.runtime.config_sources if s.schema == scheme]
-    extra = tuple(folder for folder in folders if Path(folder) != CONF)
-    return _plan(config, hydra, extra, None)
 
 
 def _folders(arguments: Namespace) -> Paths:
@@ -209,9 +196,9 @@ def _plan(
         if not differences(config, known[tag]):
             break
     made = planning.plan(config, known, env)
-    launched = _launched(hydra)
-    command = _command(hydra, folders, launched)
-    return replace(made, command=command, launched=launched)
+    launcher = plain(hydra.launcher) if _launched(hydra) else None
+    command = _command(hydra, folders, launcher is not None)
+    return replace(made, command=command, launcher=launcher)
 
 
 def _names(override: str, key: str, name: str) -> bool:
