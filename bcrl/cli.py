@@ -8,14 +8,12 @@ from __future__ import annotations
 import os
 import sys
 from argparse import Namespace
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import hydra
 
 from bcrl.common.files import make_directory
-from bcrl.common.signals import EXIT_CODE, Interrupted, heard
+from bcrl.common.signals import EXIT_CODE, Interrupted
 from bcrl.common.terminal import ready, say, show
 from bcrl.config import flags
 from bcrl.config.describe import describe
@@ -32,16 +30,10 @@ def main() -> None:
     """Console entry point; rejects bad input with one message before any work."""
     ready()
     try:
-        with _one_message():
-            if not sys.argv[1:]:
-                show(flags.short())
-                sys.exit(2)
-            asked = flags.arguments()
-            plans = [] if _shown(asked) else _planned(asked)
+        plans = _planned()
         if plans:
             from bcrl.run import runner
 
-            heard()
             runner.run(*plans)
     except BcrlError as error:
         say(f"bcrl: {error}")
@@ -51,8 +43,29 @@ def main() -> None:
         sys.exit(EXIT_CODE)
 
 
+def _planned() -> list[Plan]:
+    """The plans to run here; none if something is shown, or Slurm has run them.
+
+    Raises BcrlError for whatever goes wrong.
+    """
+    try:
+        if not sys.argv[1:]:
+            show(flags.short())
+            sys.exit(2)
+        asked = flags.arguments()
+        return [] if _shown(asked) else _checked(asked)
+    except BcrlError:
+        raise
+    except Exception as error:
+        if os.environ.get(FULL_ERROR) == "1":
+            raise
+        words = " ".join(str(error).split()) or "no further words"
+        why = f"{type(error).__name__}: {words}; {FULL_ERROR}=1 shows where"
+        raise BcrlError(why) from error
+
+
 def _shown(asked: Namespace) -> bool:
-    """Whether a flag asks for something that is shown without a plan, and is shown."""
+    """Whether a flag asks for something that needs no plan; it is shown then."""
     if asked.experimental_rerun:
         raise BcrlError("--experimental-rerun: unpickles a file, which isn't supported")
     if asked.config_path:
@@ -70,8 +83,8 @@ def _shown(asked: Namespace) -> bool:
     return True
 
 
-def _planned(asked: Namespace) -> list[Plan]:
-    """The plans to run here; none if something is shown, or Slurm has run them."""
+def _checked(asked: Namespace) -> list[Plan]:
+    """The checked plans to run here, after what flags ask for."""
     from bcrl.config import jobs
     from bcrl.run import records, status
 
@@ -91,7 +104,6 @@ def _planned(asked: Namespace) -> list[Plan]:
     if plans[0].launcher:
         from bcrl.run import launchers
 
-        heard()
         launchers.launch(plans)
         return []
     return plans
@@ -105,27 +117,12 @@ def _show_by_hydra(asked: Namespace) -> None:
     shows = hydra.main(
         version_base="1.3", config_path=str(CONF), config_name=CONFIG_NAME
     )
-    shows(lambda _: None)()
-
-
-@contextmanager
-def _one_message() -> Iterator[None]:
-    """Make a BcrlError of whatever goes wrong; HYDRA_FULL_ERROR=1 shows where."""
-    before = os.environ.get(FULL_ERROR)
-    os.environ[FULL_ERROR] = "1"  # Hydra would print a traceback and exit
+    before = os.environ.get(FULL_ERROR, "0")
+    os.environ[FULL_ERROR] = "1"  # so that Hydra raises its errors
     try:
-        yield
-    except BcrlError:
-        raise
-    except Exception as error:
-        if before == "1":
-            raise
-        words = " ".join(str(error).split()) or "no further words"
-        why = f"{type(error).__name__}: {words}; {FULL_ERROR}=1 shows where"
-        raise BcrlError(why) from error
+        shows(lambda _: None)()
     finally:
-        os.environ.pop(FULL_ERROR)
-        os.environ.update({} if before is None else {FULL_ERROR: before})
+        os.environ[FULL_ERROR] = before
 
 
 if __name__ == "__main__":

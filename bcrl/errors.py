@@ -1,7 +1,5 @@
 """Errors that a user can correct: one clear message, no traceback."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable
 
@@ -56,5 +54,4 @@ def guess(word: str, known: Iterable[str]) -> str:
 
 def closest(word: str, known: Iterable[str], like: float = 0.5) -> str | None:
     """The known word that is most like `word`, if one is like it at all."""
-    found = difflib.get_close_matches(word, sorted(known), n=1, cutoff=like)
-    return found[0] if found else None
+    return next(iter(difflib.get_close_matches(word, sorted(known), 1, like)), None)

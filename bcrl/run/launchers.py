@@ -25,7 +25,6 @@ from bcrl.errors import BcrlError, ConfigError
 from bcrl.run import records, runner
 from bcrl.run.schedule import merged
 
-_COMMANDS = ("sbatch", "srun", "squeue")  # of Slurm's, that must exist here
 _PATIENCE = 1800.0  # seconds that squeue may fail, as while Slurm restarts
 _ARRAY = 1000  # jobs per array: Slurm's MaxArraySize is 1001 unless a site changed it
 
@@ -65,13 +64,18 @@ def launch(plans: Sequence[Plan]) -> None:
     Raises SeedsFailed as `runner.run` does, Unattended if Slurm keeps jobs that this
     command can't wait for, and Interrupted after a signal.
     """
-    if missing := [name for name in _COMMANDS if not shutil.which(name)]:
+    commands = ("sbatch", "srun", "squeue")
+    if missing := [name for name in commands if not shutil.which(name)]:
         why = f"there is no {', '.join(missing)} here: run it on a login node"
         raise ConfigError("hydra/launcher", "slurm", why)
-    params, telling = dict(plans[0].launcher or {}), plans[0].config["progress"]
+    params = dict(plans[0].launcher or {})
     size, folder = params.pop("seeds_per_job", None), params["submitit_folder"]
-    del params["_target_"]
-    jobs = [job for plan in merged(plans) for job in _divided(plan, size)]
+    jobs: list[Plan] = []
+    for plan in merged(plans):
+        number = -(-len(plan.seeds) // size) if size else 1
+        parts = [part(plan.seeds, f"{k}/{number}") for k in range(1, number + 1)]
+        divided = [replace(plan, seeds=seeds) for seeds in parts]
+        jobs += [each for each in divided if records.pending(each)]
     executor, arrays, stop = _executor(params), list[str](), Stop()
     with stop.on_signals():
         for first in range(0, len(jobs), _ARRAY):
@@ -88,12 +92,13 @@ def launch(plans: Sequence[Plan]) -> None:
             if stop.requested:
                 break
         if arrays or stop.requested:
-            _wait(arrays, telling != "none", stop)
+            _wait(arrays, plans[0].config["progress"] != "none", stop)
     runner.check_complete(plans)
 
 
 def _executor(params: dict[str, Any]) -> submitit.AutoExecutor:
     """Submitit's executor with the parameters of the YAML."""
+    del params["_target_"]
     folder, limit = params.pop("submitit_folder"), params.pop("max_num_timeout")
     executor = submitit.AutoExecutor(folder, "slurm", slurm_max_num_timeout=limit)
     # Since Slurm 22.05 each step has one core unless it asks for more.
@@ -101,14 +106,6 @@ def _executor(params: dict[str, Any]) -> submitit.AutoExecutor:
     params["additional_parameters"] = {"requeue": True}  # also after a node's failure
     executor.update_parameters(**{f"slurm_{key}": params[key] for key in params})
     return executor
-
-
-def _divided(plan: Plan, size: int | None) -> list[Plan]:
-    """The plan, cut into parts of at most `size` seeds, without complete parts."""
-    number = -(-len(plan.seeds) // size) if size else 1
-    parts = [part(plan.seeds, f"{k}/{number}") for k in range(1, number + 1)]
-    divided = [replace(plan, seeds=seeds) for seeds in parts]
-    return [each for each in divided if records.pending(each)]
 
 
 def _rejected(error: Exception, arrays: Sequence[str], taken: int, n: int) -> BcrlError:
@@ -130,20 +127,19 @@ def _wait(arrays: Sequence[str], telling: bool, stop: Stop) -> None:
     names = " ".join(arrays)
     while not stop.requested:
         listed, why = _squeue("--me", "--array", "--format=%F %T")
-        if listed is None:
-            now = f"squeue fails, trying again: {why}"
-            if time.monotonic() > answered + _PATIENCE:
-                text = f"squeue has failed for {_PATIENCE / 60:.0f} minutes: {why}"
-                more = f"the jobs of {names} may still run (--status shows it)"
-                raise Unattended(f"{text}; {more}")
-        else:
+        now = f"squeue fails, trying again: {why}"
+        if listed is not None:
             answered = time.monotonic()
             jobs = [line.split() for line in listed.splitlines()]
             states = Counter(state for array, state in jobs if array in arrays)
             if not states:
                 return
             now = ", ".join(f"{n} {s.lower()}" for s, n in sorted(states.items()))
-        if now != before and (telling or listed is None):
+        elif time.monotonic() > answered + _PATIENCE:
+            text = f"squeue has failed for {_PATIENCE / 60:.0f} minutes: {why}"
+            more = f"the jobs of {names} may still run (--status shows it)"
+            raise Unattended(f"{text}; {more}")
+        if now != before and (telling or why):
             say(f"Slurm: {now}")
         pause = 1.0 if now != before else min(30.0, 1.2 * pause)
         before = now
@@ -155,12 +151,12 @@ def _wait(arrays: Sequence[str], telling: bool, stop: Stop) -> None:
 
 def _squeue(*options: str) -> tuple[str | None, str]:
     """Slurm's queue, or None and why squeue fails, as while Slurm restarts."""
-    command: Any = ["squeue", "--noheader", *options]
-    decoding: Any = {"encoding": "utf-8", "errors": "replace"}
+    command = ["squeue", "--noheader", *options]
     try:
-        done = subprocess.run(command, capture_output=True, timeout=60, **decoding)
+        done = subprocess.run(command, capture_output=True, timeout=60)
     except (OSError, subprocess.TimeoutExpired) as error:
         return None, str(error)
+    said = (done.stderr if done.returncode else done.stdout).decode(errors="replace")
     if done.returncode:
-        return None, " ".join(done.stderr.split()) or f"exit code {done.returncode}"
-    return done.stdout.strip(), ""
+        return None, " ".join(said.split()) or f"exit code {done.returncode}"
+    return said.strip(), ""

@@ -119,9 +119,9 @@ def forged(path, structure, data=b""):
 @pytest.mark.parametrize(
     "structure",
     [
-        ["object", "os.system", {"command": "true"}],
-        ["object", "bcrl.q.Sum", {"terms": ["list", []], "more": 1}],
-        ["object", "bcrl.q.Sum"],
+        ["object", ["os.system", {"command": "true"}]],
+        ["object", ["bcrl.q.functions.Sum", {"terms": ["list", []], "more": 1}]],
+        ["object", ["bcrl.q.functions.Sum", []]],
         ["array", [0, "|O", [1], "C"]],
         ["array", [0, "<f8", [1000], "C"]],
         ["array", [-8, "<f8", [1], "C"]],

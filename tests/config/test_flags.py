@@ -219,36 +219,6 @@ def test_the_overview_tells_states_apart_by_locks_and_files(tmp_path):
     assert states(overview.status(asked))["smoke maze FQI@t"] == [6, 2, 0, 2, 1, 1]
 
 
-def test_a_checkpoint_tells_how_far_its_seeds_are(tmp_path, monkeypatch):
-    from bcrl.run import checkpoints
-
-    p = plan(
-        *SMALL,
-        "curriculum=on",
-        f"runs_dir={tmp_path}",
-        "checkpoint_every=1e-9",
-        "seeds.count=1",
-        "tag=t",
-    )
-    real, saved = checkpoints.save_checkpoint, []
-
-    def save(*given):
-        saved.append(given[2])
-        real(*given)
-        if len(saved) == 6:
-            raise MemoryError
-
-    monkeypatch.setattr(checkpoints, "save_checkpoint", save)
-    with pytest.raises(runner.SeedsFailed):
-        runner.run(p)
-    assert saved == sorted(saved) and 0 < saved[-1] < 1
-    assert checkpoints.batches(p) == {(0,): saved[-1]}
-    assert checkpoints.shares(p.directory) == {0: saved[-1]}
-    records.write_status(p, 0, "running", {})
-    row = overview.status(arguments(f"runs_dir={tmp_path}")).splitlines()[1]
-    assert f" {100 * saved[-1]:.0f} %" in row
-
-
 # --- debug and local ---
 
 

@@ -103,7 +103,7 @@ def test_an_interrupted_run_logs_nothing_twice(tmp_path, monkeypatch):
         measure(training, snapshot)
         seen.append(snapshot.count)
         if len(seen) == 7:
-            stops[0].request()
+            stops[0].requested = True
 
     def stoppable(job, tick, stop):
         stops.append(stop)

@@ -19,7 +19,7 @@ from bcrl.run import costs, progress, records, runner, status
 from bcrl.run.origin import run_origin
 from bcrl.run.progress import Progress, Tick
 from bcrl.run.schedule import merged, ordered
-from bcrl.run.workers import Died, cores, do_jobs
+from bcrl.run.workers import cores, do_jobs
 from tests.conftest import arguments, plan, plans
 from tests.results.made_up import made_up_plan, write_seeds
 from tests.run.light import work
@@ -113,8 +113,9 @@ def test_the_time_to_go_is_a_schedule_of_expected_times():
         shown.tick(number, Tick(1, 10, spent))
     slower = (220.0 + progress._PRIOR) / (110.0 + progress._PRIOR)
     assert shown.to_go() == pytest.approx(40.0 * slower)
-    shown.tick(2, Tick(1, 5, 20.0))  # but this kind is as fast as expected
-    assert shown.to_go() == pytest.approx(20.0)
+    shown.tick(2, Tick(1, 5, 20.0))  # as fast as expected, half done
+    slower = (240.0 + progress._PRIOR) / (130.0 + progress._PRIOR)
+    assert shown.to_go() == pytest.approx(20.0 * slower)
 
 
 def test_the_estimate_is_right_when_the_model_is_off_by_a_factor():
@@ -163,7 +164,7 @@ def test_a_process_that_dies_loses_its_job_and_is_replaced():
     found = dict(
         do_jobs(work, [0, 1, 2, 3], 1, lambda *each: reports.append(each), stop)
     )
-    assert found == {0: 0, 1: Died(3), 2: 20, 3: 30}
+    assert found == {0: 0, 1: "its process ended with exit code 3", 2: 20, 3: 30}
     assert reports == [(number, number) for number in range(4)]
 
 
@@ -208,10 +209,10 @@ def replaced(old: str, new: str):
 )
 def test_a_changed_result_is_not_complete_and_is_named(tmp_path, suffix, damage):
     p = made(tmp_path, range(3))
-    assert records.pending(p) == [] and records.damaged(p.directory, p.seeds) == {}
+    assert records.pending(p) == []
     damage(seed_path(p.directory, 1, suffix))
     assert records.pending(p) == [1]
-    (why,) = records.damaged(p.directory, p.seeds).values()
+    why = records.state(p.directory, 1)[1]
     assert suffix.upper() in why
     table = status.status(arguments(f"runs_dir={tmp_path}"))
     assert f"smoke hill BC-FQI, seed 1: {why}" in table
@@ -222,7 +223,7 @@ def test_a_seed_of_another_variant_is_not_complete(tmp_path):
     other = made_up_plan(tmp_path, "hill", "C-FQI", range(1))
     p.directory.rename(other.directory)
     assert records.pending(other) == [0]
-    assert "belongs to variant" in records.damaged(other.directory, [0])[0]
+    assert "belongs to variant" in records.state(other.directory, 0)[1]
 
 
 def test_a_rerun_makes_a_changed_seed_again_and_reports_it(tmp_path, capsys):
@@ -263,6 +264,6 @@ def test_a_variant_that_diverges_is_named_at_the_end(tmp_path):
         p = made_up_plan(tmp_path, "hill", name, range(3), config=config)
         table = {"stage": 1, "task": 1, "iteration": [1, 2], "q_error": [4.0, last]}
         write_seeds(p, lambda seed, table=table: pd.DataFrame(table))
-        lines.append(list(status.closing_lines([p], 1.0)))
+        lines.append(status.diverging_lines(p))
     assert lines[0] == []
     assert "hill SBC-FQI, seeds 0–2: q_error" in lines[1][0]

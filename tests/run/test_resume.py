@@ -115,7 +115,7 @@ def test_a_checkpoint_of_other_code_counts_as_absent(
     p, path = interrupted(tmp_path / "a")
     before = path.read_bytes()
     monkeypatch.setattr(checkpoints, "_code", lambda: "another")
-    assert checkpoints.batches(p) == {} and path.read_bytes() == before
+    assert not checkpoints.batches(p) and path.read_bytes() == before
     runner.run(p)  # from the start
     assert about(p, 0)["interruptions"] == 0 and not path.exists()
 
@@ -123,7 +123,7 @@ def test_a_checkpoint_of_other_code_counts_as_absent(
 def test_a_checkpoint_names_our_code_and_the_users(tmp_path, monkeypatch):
     made = plan("env=maze", "scale=smoke", f"runs_dir={tmp_path}")
     about = [checkpoints._about(replace(made, sources=x)) for x in ("", "A", "B")]
-    monkeypatch.setattr(checkpoints, "_OURS", b"other sources of ours")
+    monkeypatch.setattr(checkpoints, "_OURS", [b"other sources of ours"])
     checkpoints._code.cache_clear()
     about.append(checkpoints._about(made))
     checkpoints._code.cache_clear()

@@ -312,18 +312,13 @@ def test_a_sweep_with_a_failing_job_exits_with_1_and_names_the_command(bcrl, tmp
 
 
 @pytest.mark.slow
-def test_the_command_runs_a_sweep_with_a_line_per_task_and_a_closing_table(
-    bcrl, tmp_path
-):
+def test_the_command_runs_a_sweep_with_a_line_per_task(bcrl, tmp_path):
     small = ("scale=smoke", "seeds.count=1", "algorithm/regressor=tabular", "tag=t")
     for first in (True, False):  # the second time all seeds are complete
         done = bcrl("-m", "env=maze", "curriculum=on,off", *small)
         assert done.returncode == 0, done.stderr
         assert ("C-FQI@t · T10 · iteration 20/20 · seed 0" in done.stderr) == first
-        lines = [line.split()[:4] for line in done.stderr.splitlines()]
-        table = [["maze", f"{name}@t", "1", "0"] for name in ("C-FQI", "FQI")]
-        assert [line for line in lines if line in table] == table
-        assert "peak memory" in done.stderr
+        assert ("maze C-FQI@t: 1 of 1 seeds complete" in done.stderr) != first
     made = tmp_path.glob("runs/smoke/maze/*/seed_0000.json")
     commands = [json.loads(path.read_text())["command"] for path in made]
     assert (
