@@ -2,7 +2,6 @@
 
 import os
 import signal
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
@@ -28,12 +27,8 @@ class Stop:
     def on_signals(self) -> Iterator[None]:
         """Signals request a stop; the same one again ends the process at once.
 
-        Signals that are ignored (as by nohup) stay ignored, and only the main thread
-        receives any.
+        Signals that are ignored (as by nohup) stay ignored.
         """
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
         came = set()  # a scheduler may send two kinds, one soon after the other
 
         def note(number: int, frame: Any) -> None:

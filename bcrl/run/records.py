@@ -21,8 +21,9 @@ from bcrl.results.read import BadFile, read_document, read_recorded
 from bcrl.run import locks
 
 _MALFORMED = (ValueError, LookupError, TypeError, AttributeError, yaml.YAMLError)
-INTERRUPTED, WAITING = "interrupted", "waiting"
-STATES = (COMPLETE, RUNNING, INTERRUPTED, FAILED, WAITING)  # where a seed may stand
+INTERRUPTED, DAMAGED, WAITING = "interrupted", "damaged", "waiting"
+#: Where a seed may stand.
+STATES = (COMPLETE, RUNNING, INTERRUPTED, FAILED, DAMAGED, WAITING)
 
 
 def check_directory(plan: Plan) -> None:
@@ -80,13 +81,18 @@ def state(directory: Path, seed: int) -> tuple[str, str]:
             read_recorded(path, document)
     except BadFile as error:
         what = error.finding.what.replace(f"{layout.seed_name(seed)}.json", "the JSON")
-        return WAITING, f"the {error.finding.path.suffix[1:].upper()} {what}"
+        return DAMAGED, f"the {error.finding.path.suffix[1:].upper()} {what}"
     return INTERRUPTED if noted == RUNNING else noted, why
 
 
 def states(directory: Path, seeds: Sequence[int]) -> dict[int, tuple[str, str]]:
     """The `state` of each seed."""
     return {seed: state(directory, seed) for seed in seeds}
+
+
+def problems(name: str, found: Mapping[int, tuple[str, str]]) -> list[str]:
+    """Lines about failed and damaged seeds, given the `states` of a variant's seeds."""
+    return by_reason(name, {s: f"{x}: {why}" for s, (x, why) in found.items() if why})
 
 
 def is_complete(directory: Path, seed: int) -> bool:

@@ -4,7 +4,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 
 from bcrl.common import compiling
 from bcrl.common.signals import Interrupted, Stop
@@ -47,8 +46,8 @@ def run(*plans: Plan) -> None:
                 _wait(jobs, quiet, stop)
     if jobs:
         raise Interrupted
-    if not quiet:
-        for line in chain.from_iterable(map(status.diverging_lines, plans)):
+    for plan in plans if not quiet else ():
+        for line in status.diverging_lines(plan):
             say(line)
     _check(plans, failed)
 
@@ -89,8 +88,8 @@ def _prepare(plan: Plan, quiet: bool) -> None:
     name, states = f"{plan.env} {plan.name}", records.states(plan.directory, plan.seeds)
     if note := costs.memory_note(plan):
         say(f"{name}: {note}")
-    for line in status.damage(f"bcrl: {name}", states):
-        say(line)
+    for line in records.problems(f"bcrl: {name}", states):
+        say(f"{line}; it is computed again")
     done = sum(state == COMPLETE for state, _ in states.values())
     if done and not quiet:
         say(f"{name}: {done} of {len(plan.seeds)} seeds complete")
@@ -128,10 +127,10 @@ def _train(jobs: Sequence[Job], failed: Failures, stop: Stop) -> None:
         shown.close()
 
 
-def _is_free(job: Job) -> bool:
+def _is_free(work: Job) -> bool:
     """Whether this process can train something of a job; of a checkpoint's, all."""
-    held = [locks.is_held(job.plan.directory, seed) for seed in job.seeds]
-    return not (any(held) if job.resumes else all(held))
+    held = [locks.is_held(work.plan.directory, seed) for seed in work.seeds]
+    return not (any(held) if work.resumes else all(held))
 
 
 def _wait(jobs: Sequence[Job], quiet: bool, stop: Stop) -> None:

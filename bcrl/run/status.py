@@ -1,7 +1,7 @@
 """For the terminal: what a command would run, what is done, what went wrong."""
 
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,26 +11,26 @@ from bcrl.config import jobs
 from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
 from bcrl.results import layout
-from bcrl.results.layout import FAILED, RUNNING
+from bcrl.results.layout import RUNNING
 from bcrl.run import costs, locks, records
-from bcrl.run.records import STATES, WAITING
+from bcrl.run.records import STATES
 from bcrl.run.schedule import Failures, merged, ordered
 
 
 def dry_run(plans: Sequence[Plan]) -> str:
     """The jobs that these plans would be now, and their expected costs."""
     plans, failed, rows = merged(plans), Failures(), {}
-    jobs = ordered(plans, failed)
+    left = ordered(plans, failed)
     for plan in plans:
-        own = [job for job in jobs if job.plan is plan]
+        own = [job for job in left if job.plan is plan]
         todo = layout.spelled([seed for job in own for seed in job.seeds])
         done = len(plan.seeds) - len(records.pending(plan))
         minutes = sum(job.seconds for job in own) / 60
         rows[str(plan.directory)] = [done, todo, len(own), minutes]
     hopeless = [why for reasons in failed.values() for why in set(reasons.values())]
-    seconds, workers = [job.seconds for job in jobs], plans[0].config["workers"]
+    seconds, workers = [job.seconds for job in left], plans[0].config["workers"]
     wall = f"{costs.makespan(seconds, workers) / 60:.1f} min with workers={workers}"
-    total = f"{len(jobs)} jobs, about {sum(seconds) / 60:.1f} core minutes"
+    total = f"{len(left)} jobs, about {sum(seconds) / 60:.1f} core minutes"
     last = f"{total}, {wall}; nothing was run or written"
     table = _table(rows, "complete", "to do", "jobs", "core min")
     return "\n".join([table, *hopeless, last])
@@ -58,21 +58,12 @@ def status(arguments: Namespace) -> str:
     lines: list[str] = []
     for directory, seeds in asked:
         name, found = " ".join(directory.parts[-3:]), records.states(directory, seeds)
-        failed = {s: f"failed: {x[1]}" for s, x in found.items() if x[0] == FAILED}
-        lines += records.by_reason(name, failed) + damage(name, found)
-        states = [
-            RUNNING if locks.is_held(directory, s) else found[s][0] for s in seeds
-        ]
+        lines += records.problems(name, found)
+        found |= {s: (RUNNING, "") for s in seeds if locks.is_held(directory, s)}
+        states = [state for state, _ in found.values()]
         rows[name] = [len(seeds), *map(states.count, STATES)]
     rows["in all"] = [sum(column) for column in zip(*rows.values(), strict=True)]
     return "\n".join([_table(rows, "seeds", *STATES), *lines])
-
-
-def damage(name: str, states: Mapping[int, tuple[str, str]]) -> list[str]:
-    """A line for each way in which files of finished seeds are damaged."""
-    found = {s: why for s, (state, why) in states.items() if state == WAITING and why}
-    again = {s: f"{why}; a rerun makes it again" for s, why in found.items()}
-    return records.by_reason(name, again)
 
 
 def diverging_lines(plan: Plan) -> list[str]:

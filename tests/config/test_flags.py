@@ -186,7 +186,7 @@ def test_the_command_shows_tables_and_writes_nothing(tmp_path, monkeypatch, caps
 
 
 def states(text: str) -> dict[str, list[int]]:
-    """Row by row: seeds, complete, running, interrupted, failed, waiting."""
+    """Row by row: seeds, complete, running, interrupted, failed, damaged, waiting."""
     head, *rows = text.splitlines()
     ends = [
         re.search(rf"\b{word}\b", head).end() for word in ("seeds", *overview.STATES)
@@ -212,11 +212,11 @@ def test_the_overview_tells_states_apart_by_locks_and_files(tmp_path):
         arguments(f"runs_dir={tmp_path}"),  # all that was ever begun
     ):
         said = overview.status(asked)
-        assert states(said) == {"smoke maze FQI@t": [6, 2, 1, 1, 1, 1]}
+        assert states(said) == {"smoke maze FQI@t": [6, 2, 1, 1, 1, 0, 1]}
         assert "FQI@t, seed 4: failed: key=1: no" in said
     assert everything(tmp_path) == before and computing.holds()
     computing.release()
-    assert states(overview.status(asked))["smoke maze FQI@t"] == [6, 2, 0, 2, 1, 1]
+    assert states(overview.status(asked))["smoke maze FQI@t"] == [6, 2, 0, 2, 1, 0, 1]
 
 
 # --- debug and local ---

@@ -215,7 +215,7 @@ def test_a_changed_result_is_not_complete_and_is_named(tmp_path, suffix, damage)
     why = records.state(p.directory, 1)[1]
     assert suffix.upper() in why
     table = status.status(arguments(f"runs_dir={tmp_path}"))
-    assert f"smoke hill BC-FQI, seed 1: {why}" in table
+    assert f"smoke hill BC-FQI, seed 1: damaged: {why}" in table
 
 
 def test_a_seed_of_another_variant_is_not_complete(tmp_path):
@@ -234,7 +234,7 @@ def test_a_rerun_makes_a_changed_seed_again_and_reports_it(tmp_path, capsys):
     second.write_bytes(before.replace(b"1", b"2", 1))
     runner.run(p)
     assert second.read_bytes() == before and first.stat().st_mtime_ns == when
-    assert "seed 1: the CSV is not" in capsys.readouterr().err
+    assert "seed 1: damaged: the CSV is not" in capsys.readouterr().err
     assert records.pending(p) == []
 
 
