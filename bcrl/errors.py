@@ -17,7 +17,7 @@ class ConfigError(BcrlError):
         super().__init__(f"{key}={value}: {allowed}")
         self.key, self.value, self.allowed = key, value, allowed
 
-    def __reduce__(self) -> tuple:  # so that it can leave a worker process
+    def __reduce__(self) -> tuple:  # so that it can leave a process
         return type(self), (self.key, self.value, self.allowed)
 
 
@@ -27,9 +27,6 @@ class LostSeeds(BcrlError):
     def __init__(self, reasons: dict[int, str]) -> None:
         super().__init__("; ".join(dict.fromkeys(reasons.values())))
         self.reasons = reasons
-
-    def __reduce__(self) -> tuple:
-        return type(self), (self.reasons,)
 
 
 def at_least(key: str, value: int | None, least: int) -> None:
