@@ -4,8 +4,8 @@ import os as _os
 import signal as _signal
 import sys as _sys
 
-from bcrl.common import moved as _moved
-from bcrl.common import registration as _registration
+from bcrl.common import moved as _moved  # noqa: F401 (finds old names)
+from bcrl.common import registration as _registration  # noqa: F401
 
 __version__ = "0.1.0"
 
@@ -14,6 +14,3 @@ if (
     and _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler
 ):  # a command starts: until there is work to save, Ctrl-C ends it without a word
     _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
-
-_moved.install()
-_registration.register_with_gymnasium()

@@ -7,8 +7,6 @@ The objects are those of the `bcrl` command, without configs and files:
     results = run(stages(tasks, learner, Boost()), seeds=range(5))
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from numbers import Integral
 from pathlib import Path
@@ -30,15 +28,8 @@ from bcrl.evaluation.step_metrics import StepProbe
 from bcrl.learning.dqn import DQN
 from bcrl.learning.fqi import FQI
 from bcrl.learning.lspi import LSPI
-from bcrl.learning.stage import Learner, SeedBatch, Snapshot, Stage, learn
-from bcrl.learning.transfer import (
-    Boost,
-    PolicyReuse,
-    ResidualPolicy,
-    Shape,
-    Transfer,
-    warm_start,
-)
+from bcrl.learning.stage import Learner, SeedBatch, Stage, Transfer, learn
+from bcrl.learning.transfer import Boost, PolicyReuse, ResidualPolicy, Shape, warm_start
 from bcrl.q.regressors.ours import ForestRegressor as Forest
 from bcrl.q.regressors.ours import Tabular
 from bcrl.q.regressors.scikit import Sklearn
@@ -72,9 +63,8 @@ def stages(
     others = [t for t in transfers if not isinstance(t, Boost) and t is not warm_start]
     _check(tasks, transfers, max(len(boosts), len(others)))
     if curriculum is None:
-        earlier = [task for task in tasks if task != tasks[-1]]
-        different = [t for i, t in enumerate(earlier) if t not in earlier[:i]]
-        different.append(tasks[-1])
+        earlier = dict.fromkeys(task for task in tasks if task != tasks[-1])
+        different = [*earlier, tasks[-1]]
         order = tuple(different.index(task) for task in tasks)
     else:
         different, order = tasks, order_of(curriculum, tasks)
@@ -91,15 +81,12 @@ def stages(
 
 def _check(tasks: Sequence[Env], transfers: Sequence[Transfer], most: int) -> None:
     """Raise ConfigError for arguments that no config could have."""
-    for task in tasks:
-        if isinstance(task, type) or not hasattr(task, "n_actions"):
-            raise ConfigError("tasks", task, "is no environment, such as Maze()")
-    for transfer in transfers:
-        if isinstance(transfer, type):
-            why = f"is a class, write {transfer.__name__}()"
-            raise ConfigError("transfers", transfer.__name__, why)
-        if not callable(transfer):
-            raise ConfigError("transfers", transfer, "is no transfer, such as Boost()")
+    kinds = (("tasks", tasks, "n_actions", "an environment, such as Maze()"),)
+    kinds += (("transfers", transfers, "__call__", "a transfer, such as Boost()"),)
+    for key, values, needed, kind in kinds:
+        for value in values:
+            if isinstance(value, type) or not hasattr(value, needed):
+                raise ConfigError(key, value, f"must be {kind}")
     if most > 1 or (warm_start in transfers and len(transfers) > 1):
         why = "must be one Boost() and one other at most, or warm_start alone"
         raise ConfigError("transfers", list(transfers), why)
@@ -124,18 +111,20 @@ def run(
     compiling.check()
     seeds, metrics, target = _checked(seeds), tuple(metrics), stages[-1].env
     tasks = [*dict.fromkeys(s.env for s in stages if s.env != target), target]
-    probe: fqi_metrics.Probe | StepProbe
+    probe: fqi_metrics.Probe | StepProbe = StepProbe(seeds, tasks)
     if isinstance(stages[-1].learner, FQI):
         fqi_metrics.check_metrics(metrics, target)
         probe = fqi_metrics.Probe(seeds, tasks, metrics)
-    else:
-        probe = StepProbe(seeds, tasks)
     batch = SeedBatch(seeds, probe.states, threads or cores())
     rows = []
     length = sum(stage.learner.length for stage in stages)
     with tqdm(total=length, unit=probe.index, disable=not progress) as bar:
         for snapshot in learn(stages, batch):
-            rows += _rows(snapshot, probe, seeds)
+            measured, where = probe.measure(snapshot), probe.place(snapshot)
+            if lost := [f"seed {seeds[s]}: {why}" for s, why in probe.failed.items()]:
+                raise BcrlError(f"at {probe.index} {snapshot.count}: {', '.join(lost)}")
+            pairs = zip(seeds, measured, strict=True)
+            rows += [{"seed": seed} | where | metrics for seed, metrics in pairs]
             bar.set_description_str(f"task {snapshot.stage.task}", refresh=False)
             bar.update(snapshot.count - bar.n)
     return pd.DataFrame(rows)
@@ -150,18 +139,6 @@ def _checked(seeds: Iterable[int]) -> tuple[int, ...]:
     if not whole or not found or len(set(found)) < len(found) or min(found) < 0:
         raise ConfigError("seeds", found, "must be different whole numbers from 0 on")
     return found
-
-
-def _rows(
-    snapshot: Snapshot, probe: fqi_metrics.Probe | StepProbe, seeds: Sequence[int]
-) -> list[dict]:
-    """A snapshot's rows; BcrlError if a seed failed."""
-    measured = probe.measure(snapshot)
-    if probe.failed:
-        lost = ", ".join(f"seed {seeds[s]}: {why}" for s, why in probe.failed.items())
-        raise BcrlError(f"at {probe.index} {snapshot.count}: {lost}")
-    where, pairs = probe.place(snapshot), zip(seeds, measured, strict=True)
-    return [{"seed": seed} | where | metrics for seed, metrics in pairs]
 
 
 def read(folder: str | Path) -> pd.DataFrame:

@@ -1,7 +1,5 @@
 """Errors that a user can correct: one clear message, no traceback."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable
 
@@ -19,7 +17,7 @@ class ConfigError(BcrlError):
         super().__init__(f"{key}={value}: {allowed}")
         self.key, self.value, self.allowed = key, value, allowed
 
-    def __reduce__(self) -> tuple:  # so that it can leave a worker process
+    def __reduce__(self) -> tuple:  # so that it can leave a process
         return type(self), (self.key, self.value, self.allowed)
 
 
@@ -29,9 +27,6 @@ class LostSeeds(BcrlError):
     def __init__(self, reasons: dict[int, str]) -> None:
         super().__init__("; ".join(dict.fromkeys(reasons.values())))
         self.reasons = reasons
-
-    def __reduce__(self) -> tuple:
-        return type(self), (self.reasons,)
 
 
 def at_least(key: str, value: int | None, least: int) -> None:
@@ -56,5 +51,4 @@ def guess(word: str, known: Iterable[str]) -> str:
 
 def closest(word: str, known: Iterable[str], like: float = 0.5) -> str | None:
     """The known word that is most like `word`, if one is like it at all."""
-    found = difflib.get_close_matches(word, sorted(known), n=1, cutoff=like)
-    return found[0] if found else None
+    return next(iter(difflib.get_close_matches(word, sorted(known), 1, like)), None)

@@ -1,7 +1,5 @@
 """Arrays for compiled code, and the normal quantile."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

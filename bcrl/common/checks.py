@@ -1,11 +1,9 @@
 """Checks of plain values, whose errors name key, value and what is allowed."""
 
-from __future__ import annotations
-
-import contextlib
 import dataclasses
 import math
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -27,7 +25,9 @@ def construct(section: str, cls: type, values: Mapping[str, Any]) -> Any:
     A list is taken for a tuple. Raises ConfigError naming `section.key` otherwise.
     """
     fields, taken = {f.name: f for f in dataclasses.fields(cls)}, {}
-    hints = _hints(cls)
+    hints: dict[str, Any] = {}
+    with suppress(Exception):  # a user's file may import types for type checkers only
+        hints = get_type_hints(cls)
     for key, value in values.items():
         place = f"{section}.{key}"
         if key not in fields:
@@ -50,20 +50,12 @@ def construct(section: str, cls: type, values: Mapping[str, Any]) -> Any:
     return cls(**taken)
 
 
-def _hints(cls: type) -> dict[str, Any]:
-    """The annotated types of a class; none if some can't be found."""
-    try:
-        return get_type_hints(cls)
-    except Exception:  # of the user's file, which imports them for type checkers only
-        return {}
-
-
 def _taken(value: Any, hint: Any) -> Any:
     """A plain value as a field of type `hint` takes it; TypeError if it doesn't fit."""
     kind, of = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         for each in of:
-            with contextlib.suppress(TypeError):
+            with suppress(TypeError):
                 return _taken(value, each)
     elif kind is Literal:
         if any(type(value) is type(each) and value == each for each in of):

@@ -1,108 +1,63 @@
 """numba's cache of compiled code on disk, made safe against damage and old code.
 
-numba trusts its index and its numbered files: half a file stops every run until someone
-removes it, and a process killed between two writes leaves an index that names older
-code. Here a hash at the end of each file seals its content together with the source and
-the key it belongs to. A damaged file counts as absent. If the cache can't be written,
-the code is compiled again.
+numba trusts its files: half a file stops every run until someone removes it. Here each
+function has one file per signature, with a seal at its end: a hash of the content and
+of the source and key it belongs to. A damaged file counts as absent. If no folder can
+be written, the code is compiled again.
 """
 
-from __future__ import annotations
-
-import contextlib
 import functools
 import hashlib
 import os
-from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numba
 from numba.core import caching
 
 from bcrl.errors import BcrlError
 
-#: A decorator like numba.njit whose compiled code is kept on disk.
-kept: Any = functools.partial(numba.njit, cache=True)
-
 _SEAL = hashlib.sha256().digest_size  # bytes at the end of a file
+_UNCACHED: list[str] = []  # files of functions whose code no folder can keep
+
+
+def kept(function: Any = None, **options: Any) -> Any:
+    """A decorator like numba.njit whose compiled code is kept on disk if possible."""
+    if function is None:
+        return functools.partial(kept, **options)
+    try:
+        return numba.njit(function, cache=True, **options)
+    except RuntimeError:  # numba finds no folder that it can write
+        _UNCACHED.append(function.__code__.co_filename)
+        return numba.njit(function, **options)
 
 
 class Files(caching.IndexDataCacheFile):
-    """numba's cache files of one function, each with a seal, which numba ignores."""
+    """The files of one function, in place of numba's numbered ones and their index."""
 
     def load(self, key: Any) -> Any:
         """The compiled code for this key, or None."""
-        self._key = key
-        try:
-            return super().load(key)
-        except Exception:  # damaged, or written by another version of numba
-            return None
+        with suppress(Exception):  # damaged, or written by another version of numba
+            stored = Path(self._path(key)).read_bytes()
+            if stored[-_SEAL:] == self._seal(key, stored[:-_SEAL]):
+                return self._load_data(self._path(key))  # which ignores the seal
+        return None
 
     def save(self, key: Any, data: Any) -> None:
         """Write code; replace a damaged or outdated file."""
-        self._key = key
-        with contextlib.suppress(OSError):
-            super().save(key, data)
+        content = self._dump(data)
+        with suppress(OSError), self._open_for_write(self._path(key)) as file:
+            file.write(content + self._seal(key, content))
 
-    def _load_index(self) -> dict:
-        return super()._load_index() if self._is_whole(self._index_path) else {}
+    def _path(self, key: Any) -> str:
+        """The place of a signature's code on one processor, whatever the code is."""
+        name = hashlib.sha256(repr(key[:2]).encode()).hexdigest()[:12]
+        return self._data_path(self._index_name.replace(".nbi", f".{name}.nbc"))
 
-    def _load_data(self, name: str) -> Any:
-        if not self._is_whole(self._data_path(name)):
-            raise OSError(f"{name} is damaged or holds other code")
-        return super()._load_data(name)
-
-    @contextlib.contextmanager
-    def _open_for_write(self, filepath: str) -> Iterator[IO[bytes]]:
-        with super()._open_for_write(filepath) as file:
-            yield file
-            file.flush()
-            file.write(self._seal(filepath, Path(file.name).read_bytes()))
-
-    def _is_whole(self, path: str) -> bool:
-        try:
-            stored = Path(path).read_bytes()
-        except OSError:
-            return False
-        return stored[-_SEAL:] == self._seal(path, stored[:-_SEAL])
-
-    def _seal(self, path: str, content: bytes) -> bytes:
-        key = None if path == self._index_path else self._key
+    def _seal(self, key: Any, content: bytes) -> bytes:
         about = repr((self._version, self._source_stamp, key)).encode()
         return hashlib.sha256(content + about).digest()
-
-
-class Nowhere(caching._CacheLocator):
-    """numba's last resort: a function whose code no folder can keep."""
-
-    tried: str | None = None  # the folder beside the last such function
-
-    def __init__(self, py_func: Any, py_file: str) -> None:
-        Nowhere.tried = os.path.join(os.path.dirname(py_file), "__pycache__")
-
-    @classmethod
-    def from_function(cls, py_func: Any, py_file: str) -> Nowhere:
-        return cls(py_func, py_file)
-
-    def ensure_cache_path(self) -> None: ...
-
-    def get_cache_path(self) -> str:
-        return os.path.join(os.devnull, "numba")  # can't exist
-
-    def get_source_stamp(self) -> str:
-        return ""
-
-    get_disambiguator = get_source_stamp
-
-
-@functools.cache
-def _sources(folder: str) -> str:
-    """A hash of all modules in a folder."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(folder).glob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 def _source_stamp(locator: Any) -> str:
@@ -111,30 +66,8 @@ def _source_stamp(locator: Any) -> str:
     numba compares only the function's own module, but compiled code contains the
     functions of other modules that it calls. Ours stand in the same package.
     """
-    return _sources(os.path.dirname(locator._py_file))
-
-
-def _register() -> None:
-    """Make numba keep compiled code in this way from now on."""
-    if caching.IndexDataCacheFile is Files:
-        return
-    caching.IndexDataCacheFile = Files
-    caching._SourceFileBackedLocatorMixin.get_source_stamp = _source_stamp
-    usual = caching.Cache.save_overload
-
-    def save_overload(cache: caching.Cache, sig: Any, data: Any) -> None:
-        with contextlib.suppress(OSError):  # for example, the folder has vanished
-            usual(cache, sig, data)
-
-    caching.Cache.save_overload = save_overload
-    # Without a home, numba would make a folder called ~ in the current one.
-    user = os.environ.get("XDG_CACHE_HOME", os.path.expanduser("~/.cache"))
-    locators = caching.CompileResultCacheImpl._locator_classes
-    known = os.path.isabs(user)
-    locators[:] = [x for x in locators if known or "UserWide" not in x.__name__]
-    locators.append(Nowhere)
-    if numba.config.CACHE_DIR:
-        numba.config.CACHE_DIR = os.path.expanduser(numba.config.CACHE_DIR)
+    paths = sorted(Path(locator._py_file).parent.glob("*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
 
 
 def check() -> None:
@@ -146,13 +79,19 @@ def check() -> None:
 
 def why_uncached() -> str | None:
     """Why compiled code is lost with the process and what to do; None if it is kept."""
-    if Nowhere.tried is None:
+    if not _UNCACHED:
         return None
     return (
-        f"compiled code isn't kept, so each start takes a minute longer: neither "
-        f"{Nowhere.tried} nor your cache folder can be written; set NUMBA_CACHE_DIR "
-        "to a folder that can"
+        "compiled code isn't kept, so each start takes a minute longer: neither "
+        f"{os.path.dirname(_UNCACHED[-1])} nor your cache folder can be written; set "
+        "NUMBA_CACHE_DIR to a folder that can"
     )
 
 
-_register()
+caching.IndexDataCacheFile = Files
+caching._SourceFileBackedLocatorMixin.get_source_stamp = _source_stamp
+if numba.config.CACHE_DIR:
+    numba.config.CACHE_DIR = os.path.expanduser(numba.config.CACHE_DIR)
+# Without a home, numba would make a folder called ~ in the current one.
+if not os.path.isabs(os.environ.get("XDG_CACHE_HOME", os.path.expanduser("~/.cache"))):
+    caching.CompileResultCacheImpl._locator_classes.remove(caching.UserWideCacheLocator)

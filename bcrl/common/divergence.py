@@ -1,7 +1,5 @@
 """Whether learned values diverge, for a run's closing lines and for its report."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,12 +1,10 @@
 """Atomic files, and documents with a digest that shows changes."""
 
-from __future__ import annotations
-
-import contextlib
 import hashlib
 import json
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -29,19 +27,19 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> Path:
             handle.flush()
             os.fsync(handle.fileno())
         os.replace(hidden, path)
-        with contextlib.suppress(OSError):  # not every file system can sync a folder
-            folder = os.open(path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
     except OSError as error:
-        gone = "" if path.parent.is_dir() else f"; the folder {path.parent} is gone"
-        why = error.strerror or error
-        raise BcrlError(f"cannot write {path}: {why}{gone}") from error
+        why = f"{error.strerror or error}"
+        why += "" if path.parent.is_dir() else f"; the folder {path.parent} is gone"
+        raise BcrlError(f"cannot write {path}: {why}") from error
     finally:
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             hidden.unlink()
+    with suppress(OSError):  # not every file system can sync a folder
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
     return path
 
 
@@ -55,12 +53,11 @@ def user_folder(variable: str, usual: str) -> Path | None:
 
     None where no home is known: `~` never names a folder.
     """
-    try:
+    with suppress(RuntimeError):
         chosen = Path(os.environ.get(variable, "")).expanduser()
         folder = chosen if chosen.is_absolute() else Path.home() / usual
-    except RuntimeError:
-        return None
-    return folder if folder.is_absolute() else None
+        return folder if folder.is_absolute() else None
+    return None
 
 
 def make_directory(directory: Path, key: str) -> None:
@@ -84,10 +81,9 @@ def sealed(document: dict[str, Any]) -> str:
 
 def is_intact(document: dict[str, Any]) -> bool:
     """Whether the values of a document that `sealed` wrote are unchanged."""
-    rest = {key: value for key, value in document.items() if key != DIGEST}
-    return document.get(DIGEST) == _digest(rest)
+    return document.get(DIGEST) == _digest(document)
 
 
 def _digest(document: dict[str, Any]) -> str:
-    text = json.dumps(document, sort_keys=True, separators=(",", ":"))
-    return sha256(text.encode())
+    rest = {key: value for key, value in document.items() if key != DIGEST}
+    return sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode())

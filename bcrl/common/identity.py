@@ -1,7 +1,5 @@
 """Which part of a config decides numbers, and where two configs differ in it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 Plain = dict[str, Any]  # a resolved config: dicts, lists and scalars
@@ -24,8 +22,7 @@ def identity(config: Plain) -> Plain:
 def differences(config: Plain, other: Plain) -> dict[str, tuple[Any, Any]]:
     """Dotted keys at which two configs' identities differ, with both values."""
     a, b = flat(identity(config)), flat(identity(other))
-    keys = sorted(a.keys() | b.keys())
-    both = {k: (a.get(k, "absent"), b.get(k, "absent")) for k in keys}
+    both = {k: (a.get(k, "absent"), b.get(k, "absent")) for k in sorted(a | b)}
     return {k: (x, y) for k, (x, y) in both.items() if x != y}
 
 
@@ -33,8 +30,6 @@ def flat(config: Plain, prefix: str = "") -> Plain:
     """Nested dicts as one, with dotted keys."""
     out: Plain = {}
     for key, value in config.items():
-        if isinstance(value, dict):
-            out |= flat(value, f"{prefix}{key}.")
-        else:
-            out[f"{prefix}{key}"] = value
+        inner = isinstance(value, dict)
+        out |= flat(value, f"{prefix}{key}.") if inner else {f"{prefix}{key}": value}
     return out

@@ -1,8 +1,5 @@
 """Old names of modules, which scripts and configs may still use."""
 
-from __future__ import annotations
-
-import importlib
 import importlib.util
 import sys
 from importlib.abc import Loader
@@ -35,37 +32,26 @@ MOVED |= {
 class _Moved(Loader):
     """Imports a module by its old name, as the same object as by its new one."""
 
-    def __init__(self, new: str) -> None:
+    def __init__(self, new: ModuleSpec) -> None:
         self.new = new
 
     @classmethod
     def find_spec(cls, name: str, path: Any = None, target: Any = None) -> Any:
-        """The spec of a module that has moved; None for all others."""
         for old, new in MOVED.items() if name.startswith("bcrl.") else ():
             if f"{name}.".startswith(f"{old}."):
-                loader = cls(new + name.removeprefix(old))
-                found = importlib.util.find_spec(loader.new)
-                package = found is not None and found.submodule_search_locations
-                return found and ModuleSpec(name, loader, is_package=bool(package))
+                found = importlib.util.find_spec(new + name.removeprefix(old))
+                package = found and found.submodule_search_locations is not None
+                return found and ModuleSpec(name, cls(found), is_package=package)
         return None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        """The module by its new name, which keeps its own spec."""
-        module = importlib.import_module(self.new)
-        self.spec = module.__spec__
-        return module
+        return importlib.import_module(self.new.name)
 
     def exec_module(self, module: ModuleType) -> None:
-        """Nothing: the module was executed under its new name."""
-        module.__spec__ = self.spec
+        module.__spec__ = self.new  # its own; it was executed under its new name
 
-    def get_code(self, name: str) -> Any:
-        """The code that `python -m` with the old name runs."""
-        spec: Any = importlib.util.find_spec(self.new)
-        return spec.loader.get_code(self.new)
+    def get_code(self, name: str) -> Any:  # what `python -m` with the old name runs
+        return self.new.loader.get_code(self.new.name)  # type: ignore
 
 
-def install() -> None:
-    """Let imports find the old names."""
-    if _Moved not in sys.meta_path:
-        sys.meta_path.insert(0, _Moved)
+sys.meta_path.insert(0, _Moved)  # type: ignore

@@ -4,11 +4,8 @@ A config alone names none. Names that were typed are the user's own, as are name
 a folder that was passed by --config-dir, and modules that BCRL_TRUST=a,b.c lists.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
-import importlib
 import importlib.util
 import os
 import re
@@ -40,20 +37,19 @@ def named_code(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
                 yield key, name
 
 
-def _single(value: Any) -> Iterator[Any]:
-    """The values in a list of lists; a value that is no list is itself the only one."""
-    if isinstance(value, list):
-        for one in value:
-            yield from _single(one)
-    else:
-        yield value
+def _single(value: Any) -> list[Any]:
+    """The values in lists of lists, or the value that is no list."""
+    if not isinstance(value, list):
+        return [value]
+    return [one for part in value for one in _single(part)]
 
 
 def trust(name: str) -> None:
     """Let configs name the package that `name` begins with, here and in workers."""
     package = re.split("[.:]", name)[0]
     if not is_trusted(package):
-        os.environ[VARIABLE] = ",".join([*_listed(), package])
+        before = os.environ.get(VARIABLE, "")
+        os.environ[VARIABLE] = f"{before},{package}".lstrip(",")
 
 
 def is_foreign(name: str, ours: Collection[str]) -> bool:
@@ -63,12 +59,8 @@ def is_foreign(name: str, ours: Collection[str]) -> bool:
 
 def is_trusted(name: str) -> bool:
     """Whether `name` is a trusted module, or lies below one."""
-    return any(f"{name}.".startswith(f"{entry}.") for entry in _listed())
-
-
-def _listed() -> list[str]:
-    entries = os.environ.get(VARIABLE, "").split(",")
-    return [entry.strip() for entry in entries if entry.strip()]
+    listed = os.environ.get(VARIABLE, "").replace(",", " ").split()
+    return any(f"{name}.".startswith(f"{entry}.") for entry in listed)
 
 
 def module(key: str, name: str, where: str, known: Collection[str] = ()) -> ModuleType:
@@ -79,10 +71,9 @@ def module(key: str, name: str, where: str, known: Collection[str] = ()) -> Modu
     if not all(part.isidentifier() for part in where.split(".")):
         raise ConfigError(key, name, "isn't the name of a module")
     if where.partition(".")[0] not in known and not is_trusted(where):
-        why = (
-            "a config alone can't name code of yours; type it on the command line, or "
-        )
-        raise ConfigError(key, name, why + "pass the config's folder by --config-dir")
+        why = "a config alone can't name code of yours; type it on the command line, "
+        why += "or pass the config's folder by --config-dir"
+        raise ConfigError(key, name, why)
     try:
         return importlib.import_module(where)
     except Exception as error:  # whatever its code does

@@ -4,11 +4,9 @@ Importing bcrl must stay light, so this module does not import Gymnasium: it reg
 the tasks once Gymnasium is imported, before or after bcrl.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import sys
-from types import ModuleType
+from typing import Any
 
 #: Name in Gymnasium → our name, and its horizon in steps.
 REGISTERED = {
@@ -36,26 +34,18 @@ class _Hook:
     """Registers the tasks at the end of Gymnasium's import."""
 
     @staticmethod
-    def find_spec(name: str, path: object = None, target: object = None) -> object:
-        """Gymnasium's own spec, whose loader registers the tasks afterwards."""
+    def find_spec(name: str, path: Any = None, target: Any = None) -> Any:
         if name != "gymnasium":
             return None
         sys.meta_path.remove(_Hook)  # type: ignore[arg-type]
-        spec = importlib.util.find_spec(name)
-        if spec is not None and spec.loader is not None:
+        spec: Any = importlib.util.find_spec(name)
+        if spec:
             execute = spec.loader.exec_module
-
-            def then_register(module: ModuleType) -> None:
-                execute(module)
-                register()
-
-            spec.loader.exec_module = then_register  # type: ignore[method-assign]
+            spec.loader.exec_module = lambda module: (execute(module), register())
         return spec
 
 
-def register_with_gymnasium() -> None:
-    """Register now if Gymnasium is imported already, else when it is."""
-    if "gymnasium" in sys.modules:
-        register()
-    elif _Hook not in sys.meta_path:
-        sys.meta_path.insert(0, _Hook)  # type: ignore[arg-type]
+if "gymnasium" in sys.modules:
+    register()
+else:
+    sys.meta_path.insert(0, _Hook)  # type: ignore[arg-type]

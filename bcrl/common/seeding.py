@@ -1,17 +1,10 @@
 """Random streams: one per seed and purpose, never a global generator."""
 
-from __future__ import annotations
-
 import numpy as np
 
 #: Purposes are numbered for good: a new one is appended, none is renumbered.
 PURPOSES = (
-    "data",
-    "exploration",
-    "replay",
-    "weights",
-    "trees",
-    "evaluation",
+    *("data", "exploration", "replay", "weights", "trees", "evaluation"),
     "shared_data",
 )
 

@@ -4,8 +4,6 @@ Only plain values, arrays, tensors and classes marked `storable` can be stored, 
 these come back: reading a file runs none of its content.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math
@@ -24,7 +22,7 @@ from bcrl.errors import BcrlError
 DERIVED = {"derived": True}
 _STORABLE: dict[str, type] = {}
 _PLAIN = (type(None), bool, int, float, str)
-_BROKEN = (ValueError, TypeError, LookupError, OSError, EOFError, MemoryError)
+_BROKEN = (ValueError, TypeError, LookupError, AttributeError, OSError, EOFError)
 
 
 def storable(cls: type) -> type:
@@ -52,26 +50,24 @@ def write(file: BinaryIO, about: dict, content: Any, given: Sequence[Any]) -> No
     objects that can't be stored.
     """
     packer = _Packer(given)
-    structure = packer.pack(content)
+    texts = {"about": about, "structure": packer.pack(content)}
+    texts = {key: json.dumps(document).encode() for key, document in texts.items()}
     # One array of bytes: each array of an NPZ costs a fraction of a millisecond.
     data = np.concatenate([np.empty(0, np.uint8), *packer.bytes])
-    np.savez(file, about=_text(about), structure=_text(structure), data=data)
+    np.savez(file, **texts, data=data)
 
 
 def read_about(path: Path) -> dict:
     """The document about an NPZ's content; BcrlError if the file can't be read."""
     with _opened(path) as stored:
-        about = _json(stored["about"])
-        if not isinstance(about, dict):
-            raise ValueError("its description is no object")
-        return about
+        return dict(json.loads(stored["about"].tobytes()))
 
 
 def read_content(path: Path, given: Sequence[Any], device: str = "cpu") -> Any:
     """The content that `write` stored, tensors on `device`; BcrlError if damaged."""
     with _opened(path) as stored:
-        unpacker = _Unpacker(stored["data"], given, device)
-        return unpacker.unpack(_json(stored["structure"]))
+        structure = json.loads(stored["structure"].tobytes())
+        return _Unpacker(stored["data"], given, device).unpack(structure)
 
 
 @contextmanager
@@ -80,7 +76,7 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         with np.load(path, allow_pickle=False) as stored:
             yield stored
-    except (*_BROKEN, zipfile.BadZipFile, NotImplementedError) as error:
+    except (*_BROKEN, MemoryError, zipfile.BadZipFile, NotImplementedError) as error:
         why = f"can't be read ({error}); remove it, then its seeds start anew"
         raise BcrlError(f"{path} {why}") from error
 
@@ -89,24 +85,19 @@ class _Packer:
     def __init__(self, given: Sequence[Any]) -> None:
         self.bytes: list[NDArray[np.uint8]] = []
         self._length = 0
-        self._kept: list[Any] = []  # so that no id in `_seen` is used again
-        self._seen: dict[int, list] = {
-            id(thing): ["given", place]
-            for place, thing in enumerate(given)
-            if not isinstance(thing, _PLAIN)
-        }
+        self._kept = list(given)  # so that no id in `_seen` is used again
+        self._seen = {id(thing): place for place, thing in enumerate(given)}
 
     def pack(self, thing: Any) -> Any:
-        if isinstance(thing, np.generic):
-            thing = thing.item()
+        thing = thing.item() if isinstance(thing, np.generic) else thing
         if type(thing) in _PLAIN:
             return thing
-        if id(thing) not in self._seen:
-            packed = self._parts(thing)
-            self._seen[id(thing)] = ["same", len(self._kept)]
-            self._kept.append(thing)
-            return packed
-        return self._seen[id(thing)]
+        if id(thing) in self._seen:
+            return ["same", self._seen[id(thing)]]
+        packed = self._parts(thing)
+        self._seen[id(thing)] = len(self._kept)
+        self._kept.append(thing)
+        return packed
 
     def _parts(self, thing: Any) -> list:
         kind, name = type(thing), type(thing).__name__
@@ -120,7 +111,7 @@ class _Packer:
             return [name, [[self.pack(k), self.pack(v)] for k, v in thing.items()]]
         if _STORABLE.get(_name(kind)) is kind:
             fields = {key: self.pack(getattr(thing, key)) for key in _fields(kind)}
-            return ["object", _name(kind), fields]
+            return ["object", [_name(kind), fields]]
         raise TypeError(f"{_name(kind)} is not storable")
 
     def _array(self, array: NDArray) -> list:
@@ -132,44 +123,41 @@ class _Packer:
         return [start, array.dtype.str, list(array.shape), order]
 
 
-@dataclasses.dataclass
 class _Unpacker:
-    data: NDArray[np.uint8]
-    given: Sequence[Any]
-    device: str
-    made: list[Any] = dataclasses.field(default_factory=list)
+    def __init__(self, data: NDArray, given: Sequence[Any], device: str) -> None:
+        self.data, self.device = data, device
+        self.made = list(given)
 
     def unpack(self, packed: Any) -> Any:
-        if not isinstance(packed, list):
-            if not isinstance(packed, _PLAIN):
-                raise ValueError("its structure holds something unknown")
+        if isinstance(packed, _PLAIN):
             return packed
-        kind, *rest = packed
-        if kind in ("given", "same"):
-            return (self.given if kind == "given" else self.made)[rest[0]]
-        made = self._parts(kind, *rest)
-        self.made.append(made)
-        return made
+        kind, what = packed
+        if kind == "same":
+            return self.made[what]
+        whole = self._whole(kind, what)
+        self.made.append(whole)
+        return whole
 
-    def _parts(self, kind: str, what: Any, fields: dict | None = None) -> Any:
-        if kind in ("list", "tuple"):
-            parts = [self.unpack(part) for part in what]
-            return parts if kind == "list" else tuple(parts)
+    def _whole(self, kind: str, parts: list) -> Any:
+        if kind == "list":
+            return [self.unpack(part) for part in parts]
+        if kind == "tuple":
+            return tuple(self.unpack(part) for part in parts)
         if kind == "dict":
-            return {self.unpack(k): self.unpack(v) for k, v in what}
-        if kind in ("array", "tensor"):
-            array = self._array(*what)
-            if kind == "array":
-                return array
+            return {self.unpack(k): self.unpack(v) for k, v in parts}
+        if kind == "array":
+            return self._array(*parts)
+        if kind == "tensor":
             import torch  # FQI does not need it
 
-            return torch.from_numpy(array).to(self.device)
-        if kind == "object" and what in _STORABLE:
-            if fields is None or fields.keys() != set(_fields(_STORABLE[what])):
-                raise ValueError(f"its {what} has other fields than this version's")
-            made = {key: self.unpack(value) for key, value in fields.items()}
-            return _STORABLE[what](**made)
-        raise ValueError(f"its structure holds an unknown {kind} {what}")
+            return torch.from_numpy(self._array(*parts)).to(self.device)
+        if kind == "object":
+            name, fields = parts
+            if fields.keys() == set(_fields(_STORABLE[name])):
+                made = {key: self.unpack(value) for key, value in fields.items()}
+                return _STORABLE[name](**made)
+            raise ValueError(f"its {name} has other fields than this version's")
+        raise ValueError(f"its structure holds an unknown {kind}")
 
     def _array(self, start: int, dtype: str, shape: list[int], order: Any) -> NDArray:
         kind = np.dtype(dtype)
@@ -177,11 +165,3 @@ class _Unpacker:
         if kind.hasobject or min(start, *shape, 0) < 0 or end > len(self.data):
             raise ValueError("its arrays lie outside of the file")
         return self.data[start:end].view(kind).reshape(shape, order=order).copy(order)
-
-
-def _text(document: Any) -> NDArray[np.uint8]:
-    return np.frombuffer(json.dumps(document).encode(), np.uint8)
-
-
-def _json(stored: NDArray[np.uint8]) -> Any:
-    return json.loads(stored.tobytes())

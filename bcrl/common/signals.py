@@ -1,28 +1,16 @@
 """Signals that request a stop: work in progress ends at its next pause."""
 
-from __future__ import annotations
-
-import contextlib
 import os
 import signal
-import threading
 from collections.abc import Iterator
-from types import FrameType
+from contextlib import contextmanager, suppress
+from typing import Any
 
 from bcrl.common.terminal import GONE
 
 #: Ctrl-C, a scheduler's stop, a lost terminal, and the early warnings of Slurm.
-SIGNALS = (
-    *(signal.SIGINT, signal.SIGTERM, signal.SIGHUP),
-    *(signal.SIGUSR1, signal.SIGUSR2),
-)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 EXIT_CODE = 75  # EX_TEMPFAIL: nothing is wrong, run the same command again
-
-
-def heard() -> None:
-    """From now on Ctrl-C raises KeyboardInterrupt instead of ending the process."""
-    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class Interrupted(BaseException):
@@ -35,23 +23,15 @@ class Stop:
     def __init__(self) -> None:
         self.requested = False
 
-    def request(self) -> None:
-        """Request a stop at the next pause."""
-        self.requested = True
-
-    @contextlib.contextmanager
+    @contextmanager
     def on_signals(self) -> Iterator[None]:
         """Signals request a stop; the same one again ends the process at once.
 
-        Signals that are ignored (as by nohup) stay ignored, and only the main thread
-        receives any.
+        Signals that are ignored (as by nohup) stay ignored.
         """
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
         came = set()  # a scheduler may send two kinds, one soon after the other
 
-        def note(number: int, frame: FrameType | None) -> None:
+        def note(number: int, frame: Any) -> None:
             if number in came:
                 signal.signal(number, signal.SIG_DFL)
                 os.kill(os.getpid(), number)
@@ -59,10 +39,10 @@ class Stop:
                 name = signal.Signals(number).name
                 # Not print: the signal may have come in the middle of one.
                 text = f"bcrl: {name}: saving; once more to quit at once\n"
-                with contextlib.suppress(*GONE):
+                with suppress(*GONE):
                     os.write(2, text.encode())
             came.add(number)
-            self.request()
+            self.requested = True
 
         used = [n for n in SIGNALS if signal.getsignal(n) is not signal.SIG_IGN]
         before = {number: signal.signal(number, note) for number in used}

@@ -1,12 +1,8 @@
 """Standard streams: closed pipes and odd locales are no reason to fail."""
 
-from __future__ import annotations
-
-import contextlib
 import os
 import sys
-from collections.abc import Sequence
-from typing import Any
+from contextlib import suppress
 
 #: Errors of a closed pipe, terminal or stream.
 GONE = (OSError, ValueError, AttributeError)
@@ -22,17 +18,16 @@ def ready() -> None:
         try:
             os.fstat(number)
         except OSError:
-            with contextlib.suppress(OSError):  # takes the lowest free descriptor
+            with suppress(OSError):  # takes the lowest free descriptor
                 os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
         if getattr(sys, name) is None:
             mode = "w" if number else "r"
             # By its usual number, which child processes inherit.
             stream = open(number, mode, encoding="utf-8", closefd=False)  # noqa: SIM115
             setattr(sys, name, stream)
-    streams: tuple[Any, ...] = (sys.stdout, sys.stderr)
-    for stream in streams:
-        with contextlib.suppress(*GONE):  # a stream of a test's or a notebook's
-            stream.reconfigure(errors="backslashreplace")
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(*GONE):  # a stream of a test's or a notebook's
+            stream.reconfigure(errors="backslashreplace")  # type: ignore
     # numba can't be imported with another number, and our loops must be compiled.
     if not count("NUMBA_NUM_THREADS"):
         os.environ.pop("NUMBA_NUM_THREADS", None)
@@ -46,19 +41,9 @@ def count(variable: str) -> int | None:
     return int(value) or None if value.isdecimal() else None
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Rows as lines: the first column to the left, all others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        row[0].ljust(widths[0])
-        + "".join(f"  {cell:>{w}}" for cell, w in zip(row[1:], widths[1:], strict=True))
-        for row in rows
-    ]
-
-
 def say(text: str) -> None:
     """Print a line on standard error."""
-    with contextlib.suppress(*GONE):
+    with suppress(*GONE):
         print(text, file=sys.stderr, flush=True)
 
 

@@ -81,15 +81,6 @@ def plans(arguments: Namespace) -> list[Plan]:
     return made
 
 
-def plan_of_job(config: DictConfig, hydra: DictConfig) -> Plan:
-    """The plan of a job that a launcher runs; the command has checked its config."""
-    hydra_compose.register_plugins()
-    scheme = safety.ConfigFolder.scheme()
-    folders = [s.path for s in hydra.runtime.config_sources if s.schema == scheme]
-    extra = tuple(folder for folder in folders if Path(folder) != CONF)
-    return _plan(config, hydra, extra, None)
-
-
 def _folders(arguments: Namespace) -> Paths:
     """The folders of configs besides ours, which leave the overrides."""
     given = [arguments.config_dir] if arguments.config_dir else []
@@ -154,11 +145,10 @@ def _plan(
     env = choices["env"]
     if env == OPEN:
         env = str(config["env"]["id"]).rpartition(":")[2].replace("/", "-")
+    launcher = hydra_compose.plain(hydra.launcher) if _launched(hydra) else None
     tag, command = _tag(config, hydra, folders), _command(hydra, folders)
     try:
-        return planning.plan(
-            config, env, tag, command=command, launched=_launched(hydra)
-        )
+        return planning.plan(config, env, tag, command=command, launcher=launcher)
     except ConfigError as error:
         option = choices.get(error.key.replace(".", "/"))  # as it was typed
         if option is None or error.key == "env":

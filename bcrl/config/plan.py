@@ -38,7 +38,7 @@ class Plan:
     config: Plain  # resolved, whole
     sources: str = ""  # a digest of the user's code that it runs
     command: str = ""  # what runs this plan alone, a line each if there are several
-    launched: bool = False  # whether a launcher gives it to Slurm
+    launcher: Plain | None = None  # of Slurm's parameters, if its jobs run this
 
     @property
     def target(self) -> Env:
@@ -89,7 +89,7 @@ def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
         asked=asked,
         seeds=part(asked, config["seeds"]["part"]),
         lockstep=config["seeds"]["lockstep"] or chosen_algorithm.LOCKSTEP,
-        device=_device(config["device"], chosen_algorithm.FAMILY),
+        device=usable_device(config["device"], chosen_algorithm.FAMILY),
         config=config,
         sources=plugins.fingerprint(config),
         **more,
@@ -136,7 +136,7 @@ def _variant(algorithm_name: str, chosen: Composition) -> str:
     return f"{type(chosen.transfer).__name__}-{whole}"  # the user's own
 
 
-def _device(wanted: str, family: str) -> str:
+def usable_device(wanted: str, family: str) -> str:
     """`cpu` or `cuda`; ConfigError if there is no such device."""
     one_of("device", wanted, ["cpu", "cuda", "auto"])
     if family != "DQN" or wanted == "cpu":

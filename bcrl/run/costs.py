@@ -1,10 +1,7 @@
 """The cost model of docs/explanation/cost.md, by environment and variant."""
 
-from __future__ import annotations
-
 import heapq
 import os
-import resource
 from collections.abc import Iterable
 
 from bcrl.config.plan import Plan
@@ -31,11 +28,10 @@ _SIMULATED = {"FQI": 0.2, "DQN": 4e-4}
 
 def expected(plan: Plan) -> float:
     """Seconds of one core that a seed of `plan` is expected to take."""
-    known = _SECONDS.get(plan.env, {})
+    if known := _SECONDS.get(plan.env, {}).get(plan.variant):
+        return known * plan.length / _LENGTH[plan.env]
     rate = _OTHERWISE[plan.family]
     rate += _SIMULATED[plan.family] if is_simulated(plan.target) else 0.0
-    if plan.variant in known:
-        rate = known[plan.variant] / _LENGTH[plan.env]
     return rate * plan.length
 
 
@@ -49,21 +45,20 @@ def makespan(seconds: Iterable[float], workers: int) -> float:
 
 def memory_note(plan: Plan) -> str | None:
     """A warning if the data of seeds that train together may not fit into memory."""
-    seeds, most = min(plan.lockstep, len(plan.seeds)), 0
+    needed = 0
     for stage in plan.stages:
         env, learner = stage.env, stage.learner
         evaluated = 2 * getattr(learner, "evaluation_episodes", 0)
         episodes = max(getattr(learner, "episodes", 0), evaluated)
         states = 2 * 8 * episodes * (env.horizon + 1) * env.state_dim  # and a copy
         row = 4 * (2 * env.state_dim + env.n_actions + 3)
-        most = max(most, seeds * (states + row * getattr(learner, "replay_size", 0)))
+        needed = max(needed, states + row * getattr(learner, "replay_size", 0))
+    needed *= min(plan.lockstep, len(plan.seeds))
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    there = there if limit == resource.RLIM_INFINITY else min(there, limit)
-    if most <= there:
+    if needed <= there:
         return None
-    sizes = f"up to {most / 2**30:.1f} GiB of memory, of {there / 2**30:.1f} GiB"
-    less = (
-        "seeds.lockstep=1, fewer episodes, a smaller replay or observations take less"
+    return (
+        f"the data of a batch take up to {needed / 2**30:.1f} GiB of memory, of "
+        f"{there / 2**30:.1f} GiB; seeds.lockstep=1, fewer episodes, a smaller replay "
+        "or observations take less"
     )
-    return f"the data of a batch take {sizes}; {less}"

@@ -1,23 +1,21 @@
 """A job: a batch of seeds is trained in lockstep, checkpointed, and recorded."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource
 import socket
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from bcrl.common.serialization import read_content
 from bcrl.common.signals import Stop
 from bcrl.common.terminal import say
-from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
 from bcrl.evaluation.metrics import Probe
 from bcrl.evaluation.step_metrics import StepProbe
@@ -31,70 +29,46 @@ from bcrl.run.progress import Tick
 from bcrl.run.schedule import Job
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """The result of a job; seeds that it does not name are complete."""
-
-    failed: dict[int, str] = field(default_factory=dict)  # and why
-    busy: tuple[int, ...] = ()  # in another process or another checkpoint's batch
-
-
-def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> Outcome:
+def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
     """Train those of a job's seeds that are free and write each one's files.
 
-    An error ends this job alone: its seeds have failed. After a request to `stop` it
-    leaves a checkpoint, from which the next call resumes.
+    Returns the seeds that failed, and why. An error ends this job alone: its seeds have
+    failed. After a request to `stop` it leaves a checkpoint, from which the next call
+    resumes.
     """
     plan, seeds = job.plan, job.seeds
+    strict = "raise" if plan.config["strict"] else "warn"
     try:
         records.make_run_directory(plan)
-        with claimed(plan.directory, job.seeds) as held:
-            seeds, busy, resumes = _free(job, held)
-            if not seeds:
-                return Outcome(busy=busy)
-            strict = "raise" if plan.config["strict"] else "warn"
+        with (
+            claimed(plan.directory, job.seeds) as held,
+            np.errstate(divide=strict, over=strict, invalid=strict),
+        ):
+            begun = checkpoints.batches(plan)
+            if not (resumes := seeds in begun):
+                seeds = tuple(records.pending(plan, held))
+            # The batch of a checkpoint resumes as a whole, in a job of its own.
+            others = set(seeds) - held.keys() if resumes else set().union(*begun)
+            if not seeds or others & set(seeds):
+                return {}
             try:
-                with (
-                    loggers.opened(plan.config, plan.directory, seeds) as log,
-                    np.errstate(divide=strict, over=strict, invalid=strict),
-                ):
-                    training = _Training(job, seeds, held, log)
+                with loggers.opened(plan.config, plan.directory, seeds) as log:
+                    training = _Training(replace(job, seeds=seeds), held, log)
                     failed = training.train(resumes, tick, stop)
             except Exception as error:
-                for seed in _incomplete(plan, seeds):
+                for seed in records.pending(plan, seeds):
                     with suppress(BcrlError):  # the folder may be gone
                         status = f"failed: {_reason(error)}"
                         records.write_status(plan, seed, status, {})
                 raise
             checkpoints.remove_done(plan)
-            return Outcome(failed, busy)
+            return failed
     except Exception as error:
         if not isinstance(error, (BcrlError, MemoryError)):  # unforeseen: show where
             say(traceback.format_exc())
-        who = f"{plan.env} {plan.name}, {records.named(seeds)}"
-        say(f"{who}: failed: {_reason(error)}")
-        return Outcome(dict.fromkeys(_incomplete(plan, seeds), _reason(error)))
-
-
-def _free(
-    job: Job, held: Mapping[int, Lock]
-) -> tuple[tuple[int, ...], tuple[int, ...], bool]:
-    """The seeds to train, those to try again later, and whether a checkpoint exists.
-
-    The batch of a checkpoint resumes as a whole or not at all.
-    """
-    busy = tuple(seed for seed in job.seeds if seed not in held)
-    begun = checkpoints.batches(job.plan)
-    if job.seeds in begun:
-        return ((), busy, False) if busy else (job.seeds, (), True)
-    free = _incomplete(job.plan, held)
-    if any(set(batch) & set(free) for batch in begun):
-        return (), job.seeds, False  # the process that wrote it has just died
-    return free, busy, False
-
-
-def _incomplete(plan: Plan, seeds: Any) -> tuple[int, ...]:
-    return tuple(s for s in seeds if not records.is_complete(plan.directory, s))
+        why = _reason(error)
+        say(f"{plan.env} {plan.name}, {records.named(seeds)}: failed: {why}")
+        return dict.fromkeys(records.pending(plan, seeds), why)
 
 
 def _reason(error: Exception) -> str:
@@ -105,34 +79,21 @@ def _reason(error: Exception) -> str:
     return str(error) if known else f"{type(error).__name__}: {error}"
 
 
-@dataclass
-class _Progress:
-    """What a checkpoint stores besides the learners' state."""
-
-    rows: list[list[dict[str, Any]]]  # of each seed's CSV
-    failed: dict[int, str] = field(default_factory=dict)  # by place in the batch
-    wall: float = 0.0  # seconds, with those before an interruption
-    cpu: float = 0.0
-    interruptions: int = 0
-
-
 class _Training:
     """The training of seeds whose locks are `held`."""
 
-    def __init__(
-        self,
-        job: Job,
-        seeds: tuple[int, ...],
-        held: Mapping[int, Lock],
-        log: loggers.Log,
-    ) -> None:
-        self.job, self.plan, self.seeds = job, job.plan, seeds
-        self.held, self.log = held, log
-        self.probe = _probe(job.plan, seeds)
-        self.batch = SeedBatch(seeds, self.probe.states, job.threads, self.plan.device)
-        self.run = CurriculumRun(self.plan.stages, self.batch)
-        self.progress = _Progress([[] for _ in seeds])
-        self._clocks = time.perf_counter(), time.process_time()
+    def __init__(self, job: Job, held: Mapping[int, Lock], log: loggers.Log) -> None:
+        self.job, self.held, self.log = job, held, log
+        self.plan, self.seeds = plan, seeds = job.plan, job.seeds
+        self.probe: Probe | StepProbe = Probe(seeds, plan.tasks, plan.metrics)
+        if plan.family == "DQN":
+            self.probe = StepProbe(seeds, plan.tasks)
+        self.batch = SeedBatch(seeds, self.probe.states, job.threads, plan.device)
+        self.run = CurriculumRun(plan.stages, self.batch)
+        self.rows: list[list[dict[str, Any]]] = [[] for _ in seeds]  # of the CSVs
+        self.failed: dict[int, str] = {}  # by place in the batch
+        self.interruptions = 0
+        self._began = _clocks()  # minus what was spent before an interruption
 
     def train(
         self, resumes: bool, tick: Callable[[Tick], None], stop: Stop
@@ -141,7 +102,7 @@ class _Training:
         if resumes:
             self._resume()
         host = {"host": socket.gethostname(), "pid": os.getpid()}
-        new = _incomplete(self.plan, self.seeds)
+        new = records.pending(self.plan, self.seeds)
         for seed in new:
             records.write_status(self.plan, seed, RUNNING, host)
         length, saved = self.plan.length, time.monotonic()
@@ -149,16 +110,16 @@ class _Training:
             ends = isinstance(pause, Snapshot) and pause.last_of_stage
             if isinstance(pause, Snapshot):
                 self.measure(pause)
-                self._note_time()
-                tick(Tick(pause.stage.task, pause.count, self.progress.wall))
+                wall = float((_clocks() - self._began)[0])
+                tick(Tick(pause.stage.task, pause.count, wall))
             if ends and pause.count == length:
                 break
             if stop.requested:
-                self.progress.interruptions += 1
-                self._save(pause.count / length)
+                self.interruptions += 1
+                self._save()
                 return {}
             if ends or time.monotonic() - saved >= self.plan.config["checkpoint_every"]:
-                self._save(pause.count / length)
+                self._save()
                 saved = time.monotonic()
         failed = self._record(new)
         checkpoints.checkpoint_path(self.plan, self.seeds).unlink(missing_ok=True)
@@ -166,44 +127,40 @@ class _Training:
 
     def measure(self, snapshot: Snapshot) -> None:
         """Append a row per seed; the last row of a seed may show its failure."""
-        index, progress = self.probe.index, self.progress
-        where = self.probe.place(snapshot)
+        index, where = self.probe.index, self.probe.place(snapshot)
         new = [
-            [] if place in progress.failed else [where | metrics]
+            [] if place in self.failed else [where | metrics]
             for place, metrics in enumerate(self.probe.measure(snapshot))
         ]
         self.log(index, new)
-        for rows, added in zip(progress.rows, new, strict=True):
+        for rows, added in zip(self.rows, new, strict=True):
             rows += added
         for place, why in self.probe.failed.items():
-            progress.failed.setdefault(place, f"{why} at {index} {snapshot.count}")
+            self.failed.setdefault(place, f"{why} at {index} {snapshot.count}")
 
     def _resume(self) -> None:
         """Continue from the batch's checkpoint."""
-        stored = checkpoints.load_checkpoint(self.plan, self.seeds, self.run.given)
+        path = checkpoints.checkpoint_path(self.plan, self.seeds)
+        stored = read_content(path, self.run.given, self.plan.device)
         self.run = CurriculumRun(self.plan.stages, self.batch, stored["past"])
-        self.probe.kept = stored["kept"]
-        rows = json.loads(stored["session"]["rows"])
-        self.progress = _Progress(**stored["session"] | {"rows": rows})
-        self.log(self.probe.index, rows)
+        self.probe.kept, self.failed = stored["kept"], stored["failed"]
+        self.rows, self.interruptions = json.loads(stored["rows"]), stored["stops"]
+        self._began -= stored["spent"]
+        self.log(self.probe.index, self.rows)
 
-    def _save(self, share: float) -> None:
-        """Write the batch's checkpoint; `share`: of the run, that is done."""
-        self._note_time()
-        # Rows are many small values: one text takes less time and space.
-        session = vars(self.progress) | {"rows": json.dumps(self.progress.rows)}
-        content = {"past": self.run.state, "session": session, "kept": self.probe.kept}
+    def _save(self) -> None:
+        """Write the batch's checkpoint."""
+        content = {
+            "past": self.run.state,
+            "kept": self.probe.kept,
+            "failed": self.failed,
+            # Many small values: one text takes less time and space.
+            "rows": json.dumps(self.rows),
+            "stops": self.interruptions,
+            "spent": _clocks() - self._began,
+        }
         self._check_locks()
-        checkpoints.save_checkpoint(
-            self.plan, self.seeds, share, content, self.run.given
-        )
-
-    def _note_time(self) -> None:
-        """Add the time since the last call."""
-        before, now = self._clocks, (time.perf_counter(), time.process_time())
-        self.progress.wall += now[0] - before[0]
-        self.progress.cpu += now[1] - before[1]
-        self._clocks = now
+        checkpoints.save_checkpoint(self.plan, self.seeds, content, self.run.given)
 
     def _check_locks(self) -> None:
         """BcrlError if the folder, and with it the locks, was taken away."""
@@ -211,36 +168,33 @@ class _Training:
             text = "was removed or replaced while its seeds were being computed"
             raise BcrlError(f"{self.plan.directory} {text}; run the command again")
 
-    def _record(self, new: tuple[int, ...]) -> dict[int, str]:
+    def _record(self, new: Sequence[int]) -> dict[int, str]:
         """Write the files of the `new` seeds; those that diverged, and why."""
-        self._note_time()
-        plan, progress, failed = self.plan, self.progress, {}
+        plan, failed = self.plan, {}
+        wall, cpu = map(float, _clocks() - self._began)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         facts = self.probe.facts() | {
-            "wall_seconds": progress.wall,
-            "cpu_seconds": progress.cpu / len(self.seeds),  # this seed's share
-            "interruptions": progress.interruptions,
+            "wall_seconds": wall,
+            "cpu_seconds": cpu / len(self.seeds),  # this seed's share
+            "interruptions": self.interruptions,
             "lockstep": list(self.seeds),
             "device": plan.device,
             "success": str(success_of(plan.target)),
-            "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-            / 1024,
+            "peak_memory_mib": peak / 1024,
             **self.job.origin,
         }
         for place, seed in enumerate(self.seeds):
             if seed not in new:
                 continue
             arrays, status = self.probe.arrays(place), COMPLETE
-            if why := progress.failed.get(place) or self.probe.failed.get(place):
+            if why := self.failed.get(place) or self.probe.failed.get(place):
                 failed[seed], status = why, f"failed: {why}"
                 say(f"{plan.env} {plan.name}: seed {seed} {status}")
             self._check_locks()
-            rows = progress.rows[place]
-            records.write_seed(plan, seed, status, rows, arrays, facts)
+            records.write_seed(plan, seed, status, self.rows[place], arrays, facts)
         return failed
 
 
-def _probe(plan: Plan, seeds: tuple[int, ...]) -> Probe | StepProbe:
-    """The measurement of the plan's snapshots."""
-    if plan.family == "DQN":
-        return StepProbe(seeds, plan.tasks)
-    return Probe(seeds, plan.tasks, plan.metrics)
+def _clocks() -> np.ndarray:
+    """Seconds of wall-clock time and of this process's CPU time."""
+    return np.array([time.perf_counter(), time.process_time()])

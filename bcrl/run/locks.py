@@ -4,8 +4,6 @@ The kernel holds them (flock, through filelock), so a process that dies loses it
 A lock file's text names the holder, for people to read.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os
@@ -41,7 +39,11 @@ class Lock:
         except Timeout:
             return False
         except OSError as error:
-            raise BcrlError(_why_not(self.folder, self.path, error)) from error
+            why = f"cannot write or lock {self.path}: {error.strerror}"
+            if error.errno in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
+                why += "; mount the file system with locks (Lustre: -o flock) or name "
+                why += "another folder"
+            raise BcrlError(f"runs_dir: {why}") from error
         with suppress(OSError):
             self.path.write_text(f"process {os.getpid()} on {socket.gethostname()}")
             self._file = os.stat(self.path)
@@ -60,18 +62,16 @@ class Lock:
 
     def holds(self) -> bool:
         """Whether the lock is ours and its folder still the one it was taken in."""
-        try:
+        with suppress(OSError):
             same = self._file and os.path.samestat(self._file, os.stat(self.path))
-        except OSError:
-            return False
-        return bool(same) and self._lock.is_locked
+            return bool(same) and self._lock.is_locked
+        return False
 
     def holder(self) -> str:
         """The process that holds the lock, by its own words."""
-        try:
+        with suppress(OSError):
             return self.path.read_text("utf-8", "replace") or "another process"
-        except OSError:
-            return "another process"
+        return "another process"
 
 
 def seed_lock(folder: Path, seed: int) -> Lock:
@@ -108,12 +108,3 @@ def tidy(folder: Path) -> None:
         lock = Lock(folder, path.name.removeprefix(".").removesuffix(".lock"))
         if lock.acquire():
             lock.release()
-
-
-def _why_not(folder: Path, path: Path, error: OSError) -> str:
-    """The message for a folder in which files can't be made or locked."""
-    if error.errno in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
-        what = "is on a file system without file locks"
-        more = "mount it with locks (Lustre: -o flock) or name another folder"
-        return f"runs_dir: {folder} {what} ({error.strerror}): {more}"
-    return f"runs_dir: cannot write or lock {path}: {error.strerror}"

@@ -1,7 +1,5 @@
 """The jobs that remain of plans: which seeds train together, and in which order."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,7 +21,7 @@ class Job:
 
     plan: Plan
     seeds: tuple[int, ...]
-    done: float = 0.0  # share of the run that its checkpoint has
+    resumes: bool = False  # all of them, from a checkpoint
     threads: int = 1
     origin: Mapping[str, Any] = field(default_factory=dict)  # `origin.run_origin`
 
@@ -54,32 +52,27 @@ def ordered(plans: Sequence[Plan], failed: Failures) -> list[Job]:
     A batch with a checkpoint resumes as it was. Seeds that `failed` are left out; those
     whose checkpoint can't be read are added there.
     """
-    pending, jobs = [], []
+    new, jobs = [], []
     for plan in plans:
         over = failed.get(plan.directory, {})
         left = [seed for seed in records.pending(plan) if seed not in over]
         try:
-            begun = checkpoints.batches(plan) if left else {}
+            begun = sorted(checkpoints.batches(plan)) if left else []
         except BcrlError as error:
             failed[plan.directory] = over | dict.fromkeys(left, str(error))
             continue
-        for batch, share in begun.items():
+        for batch in begun:
             if set(batch) & set(left):
-                jobs.append(Job(plan, batch, share))
+                jobs.append(Job(plan, batch, resumes=True))
                 left = [seed for seed in left if seed not in batch]
         if left:
-            pending.append((plan, left))
+            new.append((plan, left))
     workers = plans[0].config["workers"]
     # With enough variants for all workers, larger batches cost less per seed.
-    spread = 1 if len(pending) >= 2 * workers else workers
-    for plan, seeds in pending:
-        jobs += [Job(plan, batch) for batch in _divided(seeds, plan.lockstep, spread)]
+    spread = 1 if len(new) >= 2 * workers else workers
+    for plan, seeds in new:
+        least = -(-len(seeds) // plan.lockstep)  # batches of at most `lockstep` seeds
+        number = min(-(-least // spread) * spread, len(seeds))  # even for the workers
+        parts = np.array_split(seeds, number)
+        jobs += [Job(plan, tuple(part.tolist())) for part in parts]
     return sorted(jobs, key=lambda job: -job.seconds)
-
-
-def _divided(seeds: list[int], lockstep: int, workers: int) -> list[tuple[int, ...]]:
-    """Batches of at most `lockstep` seeds, spread evenly over the workers."""
-    workers = min(workers, len(seeds))
-    rounds = -(-len(seeds) // (lockstep * workers))
-    number = min(rounds * workers, len(seeds))
-    return [tuple(part.tolist()) for part in np.array_split(seeds, number)]

@@ -1,64 +1,20 @@
 """Processes that do jobs one after the other; if one dies, only its job fails."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from multiprocessing import connection, resource_tracker
 from typing import Any
 
 from bcrl.common.signals import SIGNALS, Stop
 from bcrl.common.terminal import count
 
+_KILLED = "killed (out of memory? try fewer workers or seeds.lockstep)"
 #: A job, a function to report with, and the stop that ends it early → its result.
 Do = Callable[[Any, Callable[[Any], None], Any], Any]
-
-
-@dataclass(frozen=True)
-class Died:
-    """The result of a job whose process ended by itself."""
-
-    exitcode: int
-
-    def __str__(self) -> str:
-        if self.exitcode == -signal.SIGKILL:
-            return "killed (out of memory? try fewer workers or seeds.lockstep)"
-        return f"its process ended with exit code {self.exitcode}"
-
-
-class _Worker:
-    """A process, and the number of its job; it ends with the pipe or a None in it."""
-
-    def __init__(self, do: Do) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(do, theirs), daemon=True)
-        resource_tracker.ensure_running()  # it would unblock what is blocked below
-        # A worker inherits the mask: no signal comes before it can ignore it.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-        try:
-            self.process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        theirs.close()  # so that its end shows here
-        self.job = -1  # no job
-
-    def send(self, job: Any) -> None:
-        """Give a job, or None; if the process is dead, `recv` will show it."""
-        with suppress(OSError):
-            self.pipe.send(job)
-
-    def end(self) -> None:
-        """Let the process end, without a further job."""
-        self.pipe.close()
-        self.process.join(10.0)
-        if self.process.is_alive():
-            self.process.kill()
 
 
 def do_jobs(
@@ -70,41 +26,65 @@ def do_jobs(
 ) -> Iterator[tuple[int, Any]]:
     """The jobs' numbers and results as they come, done in order by `workers` processes.
 
-    `report` takes a job's number and its reports. A job whose process dies results in
-    `Died`. After a request to stop, running jobs stop, too, and no other begins.
+    `report` takes a job's number and its reports. If a process dies, its job's result
+    is a text that says so. After a request to stop, running jobs stop, too, and no
+    other begins.
     """
-    pool = [_Worker(do) for _ in range(min(workers, len(jobs)))]
+    pool = dict(_started(do) for _ in range(min(workers, len(jobs))))
     waiting, stopped = list(range(len(jobs))), False
+    doing: dict[Any, int] = {}  # the number of a job, by its process's pipe
     try:
         while True:
-            for place, worker in enumerate(pool):
-                if waiting and worker.job < 0:
-                    if not worker.process.is_alive():
-                        pool[place] = worker = _Worker(do)
-                    worker.job = waiting.pop(0)
-                    worker.send(jobs[worker.job])
-            busy: dict[Any, _Worker] = {w.pipe: w for w in pool if w.job >= 0}
-            if not busy:
+            for pipe in [p for p in pool if p not in doing][: len(waiting)]:
+                doing[pipe] = waiting.pop(0)
+                _send(pipe, jobs[doing[pipe]])
+            if not doing:
                 return
             if stop.requested and not stopped:
                 waiting, stopped = [], True
-                for worker in busy.values():
-                    worker.send(None)
-            for pipe in connection.wait(list(busy), timeout=0.2):
-                worker = busy[pipe]
+                for pipe in doing:
+                    _send(pipe, None)
+            for pipe in connection.wait(list(doing), timeout=0.2):
                 try:
-                    kind, message = worker.pipe.recv()
+                    kind, message = pipe.recv()
                 except (EOFError, OSError):
-                    worker.process.join()
-                    kind, message = "result", Died(worker.process.exitcode or 0)
+                    process = pool.pop(pipe)
+                    process.join()
+                    why = f"its process ended with exit code {process.exitcode}"
+                    killed = process.exitcode == -signal.SIGKILL
+                    kind, message = "result", _KILLED if killed else why
+                    pool |= [_started(do)] if waiting else []
                 if kind == "report":
-                    report(worker.job, message)
+                    report(doing[pipe], message)
                 else:
-                    job, worker.job = worker.job, -1
-                    yield job, message
+                    yield doing.pop(pipe), message
     finally:
-        for worker in pool:
-            worker.end()
+        for pipe, process in pool.items():
+            pipe.close()  # then it ends
+            process.join(10.0)
+            if process.is_alive():
+                process.kill()
+
+
+def _started(do: Do) -> tuple[Any, Any]:
+    """A pipe to a new process, and the process; closing the pipe ends it."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_serve, args=(do, theirs), daemon=True)
+    resource_tracker.ensure_running()  # it would unblock what is blocked below
+    # A worker inherits the mask: no signal comes before it can ignore it.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    theirs.close()  # so that the process's end shows in ours
+    return ours, process
+
+
+def _send(pipe: Any, message: Any) -> None:
+    with suppress(OSError):  # the other end is gone, which `recv` and `poll` show
+        pipe.send(message)
 
 
 def cores() -> int:
@@ -118,7 +98,7 @@ def cores() -> int:
 class _StopByPipe:
     """A worker's stop: a message from its parent, or the parent's end."""
 
-    def __init__(self, pipe: connection.Connection) -> None:
+    def __init__(self, pipe: Any) -> None:
         self._pipe, self._requested, self._next = pipe, False, 0.0
 
     @property
@@ -129,16 +109,12 @@ class _StopByPipe:
         return self._requested
 
 
-def _serve(do: Do, pipe: connection.Connection) -> None:
+def _serve(do: Do, pipe: Any) -> None:
     """A worker's life: jobs, until a None comes or the pipe closes."""
-
-    def report(message: Any) -> None:
-        with suppress(OSError):  # the parent is gone, which `_StopByPipe` shows
-            pipe.send(("report", message))
-
     for number in SIGNALS:  # for the parent; processes of a job's own get them again
         signal.signal(number, lambda *_: None)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     with suppress(EOFError, OSError):
         while (job := pipe.recv()) is not None:
-            pipe.send(("result", do(job, report, _StopByPipe(pipe))))
+            result = do(job, lambda x: _send(pipe, ("report", x)), _StopByPipe(pipe))
+            pipe.send(("result", result))

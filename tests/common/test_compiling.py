@@ -60,8 +60,8 @@ def test_code_of_an_older_source_is_never_loaded_and_is_replaced(tmp_path):
 
 def test_without_a_folder_code_is_compiled_with_a_message(monkeypatch):
     impl = numba.core.caching.CompileResultCacheImpl
-    monkeypatch.setattr(impl, "_locator_classes", [compiling.Nowhere])
-    monkeypatch.setattr(compiling.Nowhere, "tried", None)
+    monkeypatch.setattr(impl, "_locator_classes", [])
+    monkeypatch.setattr(compiling, "_UNCACHED", [])
     assert compiling.why_uncached() is None
     assert not doubled(5) and not doubled(5)
     message = compiling.why_uncached()

@@ -164,6 +164,19 @@ def test_the_command_shows_tables_and_writes_nothing(tmp_path, monkeypatch, caps
     assert everything(tmp_path) == []
 
 
+def states(text: str) -> dict[str, list[int]]:
+    """Row by row: seeds, complete, running, interrupted, failed, damaged, waiting."""
+    head, *rows = text.splitlines()
+    ends = [
+        re.search(rf"\b{word}\b", head).end() for word in ("seeds", *overview.STATES)
+    ]
+    found = {}
+    for row in rows[: [x.startswith("in all") for x in rows].index(True)]:
+        cells = [row[:end].rsplit("  ", 1)[-1].strip() for end in ends]
+        found[row.split("  ")[0]] = [int(cell or 0) for cell in cells]
+    return found
+
+
 def test_the_overview_tells_states_apart_by_locks_and_files(tmp_path):
     options = (*SMALL, f"runs_dir={tmp_path}", "tag=t")
     runner.run(plan(*options, "seeds.count=2"))
@@ -178,36 +191,11 @@ def test_the_overview_tells_states_apart_by_locks_and_files(tmp_path):
         arguments(f"runs_dir={tmp_path}"),  # all that was ever begun
     ):
         said = overview.status(asked)
-        # Seeds: all, complete, running, interrupted, failed, waiting.
-        assert re.search(r"^smoke maze FQI@t +6 +2 +1 +1 +1 +1 ", said, re.M)
+        assert states(said) == {"smoke maze FQI@t": [6, 2, 1, 1, 1, 0, 1]}
         assert "FQI@t, seed 4: failed: key=1: no" in said
     assert everything(tmp_path) == before and computing.holds()
     computing.release()
-    assert re.search(r"FQI@t +6 +2 +2 +1 +1 ", overview.status(asked))
-
-
-def test_a_checkpoint_tells_how_far_its_seeds_are(tmp_path, monkeypatch):
-    from bcrl.run import checkpoints
-
-    words = (f"runs_dir={tmp_path}", "checkpoint_every=1e-9", "seeds=1", "tag=t")
-    p = plan(*SMALL, "curriculum=on", *words)
-    real, saved = checkpoints.save_checkpoint, []
-
-    def save(*given):
-        saved.append(given[2])
-        real(*given)
-        if len(saved) == 6:
-            raise MemoryError
-
-    monkeypatch.setattr(checkpoints, "save_checkpoint", save)
-    with pytest.raises(runner.SeedsFailed):
-        runner.run(p)
-    assert saved == sorted(saved) and 0 < saved[-1] < 1
-    assert checkpoints.batches(p) == {(0,): saved[-1]}
-    assert checkpoints.shares(p.directory) == {0: saved[-1]}
-    records.write_status(p, 0, "running", {})
-    row = overview.status(arguments(f"runs_dir={tmp_path}")).splitlines()[1]
-    assert f" {100 * saved[-1]:.0f} %" in row
+    assert states(overview.status(asked))["smoke maze FQI@t"] == [6, 2, 0, 2, 1, 0, 1]
 
 
 # --- debug and local ---

@@ -105,7 +105,7 @@ def test_slurms_keys_are_checked_and_none_is_a_command(key, value):
 
 
 def test_the_launchers_section_of_a_command_line_is_checked():
-    assert all(made.launched for made in plans(MAZE, SLURM, multirun=True))
+    assert all(made.launcher for made in plans(MAZE, SLURM, multirun=True))
     error = rejected(MAZE, SLURM, "hydra.launcher.timeout_min=0", multirun=True)
     assert "hydra.launcher.timeout_min=0" in error
     assert "workers=2" in rejected(MAZE, "hydra/launcher=joblib", multirun=True)
@@ -114,7 +114,7 @@ def test_the_launchers_section_of_a_command_line_is_checked():
 @pytest.mark.parametrize("more", [["hydra.launcher.n_jobs=3"], ["workers=3"]])
 def test_the_former_local_launcher_is_a_number_of_workers(more, capsys):
     (made,) = plans(MAZE, "hydra/launcher=local", *more, multirun=True)
-    assert made.config["workers"] == 3 and not made.launched
+    assert made.config["workers"] == 3 and not made.launcher
     assert "hydra/launcher=local" in capsys.readouterr().err
 
 
