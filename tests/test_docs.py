@@ -126,3 +126,9 @@ def test_there_is_one_version():
     assert bcrl.__version__ == project["version"] == str(CITATION["version"])
     found = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.M)
     assert found == ["Unreleased", bcrl.__version__]
+
+
+def test_the_two_files_are_included_in_their_page():
+    marked = re.findall(r'^--8<-- "(.+)"$', TEXT[DOCS / "tutorial/two_files.md"], re.M)
+    assert marked == [f"examples/minimal_{name}.py" for name in ("bc_fqi", "sbc_dqn")]
+    assert all((ROOT / name).exists() for name in marked)

@@ -1,7 +1,5 @@
 """For tests: a corridor with a goal at one end, and stages by themselves."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import ClassVar
 

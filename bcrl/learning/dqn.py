@@ -1,7 +1,5 @@
 """Deep Q-network (Mnih et al. 2015) for S seeds in lockstep, plain or boosted."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar

@@ -108,7 +108,7 @@ HERE = [OpenCorridor()]
 SENSELESS = {
     "0 tasks": ([], LEARNER),
     "there are 2 learners": (HERE, [LEARNER] * 2),
-    r"write Boost\(\)": (HERE, LEARNER, Boost),
+    r"such as Boost\(\)": (HERE, LEARNER, Boost),
     "one task": (HERE, LEARNER, ResidualPolicy()),
     "is no regressor": (HERE, FQI(1, 1, Tabular)),
     r"Sklearn\(estimator\)": (HERE, FQI(1, 1, KNeighborsRegressor())),

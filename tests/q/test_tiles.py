@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from bcrl.q.networks.tiles import WIDTH, product
+from bcrl.q.networks.tiles import WIDTH, multiply
 
 SHAPES = pytest.mark.parametrize(
     ("n_rows", "columns", "n_terms"),
@@ -16,7 +16,7 @@ SHAPES = pytest.mark.parametrize(
 def compiled(out, columns, rows, terms, a, across, along, right):
     """The product, as `bcrl.q.networks.cpu` calls it."""
     given = a, across, along, right
-    product(out, columns, rows, len(rows), terms, len(terms), *given)
+    multiply(out, columns, rows, len(rows), terms, len(terms), *given)
 
 
 def factors(n_rows, columns, n_terms):

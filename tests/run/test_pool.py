@@ -152,5 +152,5 @@ def test_a_changed_result_is_not_complete_and_is_named(tmp_path, suffix):
 
 def test_a_variant_that_diverges_is_named_at_the_end(tmp_path):
     both = [made(tmp_path, range(3), "FQI"), made(tmp_path, range(3), "SBC-FQI", 1e3)]
-    lines = status.diverging_lines(both)
+    lines = [line for plan in both for line in status.diverging_lines(plan)]
     assert lines == ["hill SBC-FQI, seeds 0–2: q_error diverges"]

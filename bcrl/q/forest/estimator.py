@@ -1,15 +1,16 @@
 """The forest as a scikit-learn estimator."""
 
 import math
+import os
 from numbers import Integral
 from typing import Any, ClassVar
 
 import numpy as np
-from joblib import effective_n_jobs
 from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.ensemble import ExtraTreesRegressor
 from sklearn.utils import check_random_state, validation
+from sklearn.utils._param_validation import Interval
 
 from bcrl.q.forest import forest
 
@@ -54,7 +55,11 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
         },
         "min_samples_split": _theirs["min_samples_split"][:1],  # no shares of the rows
         "min_samples_leaf": _theirs["min_samples_leaf"][:1],
-        "n_jobs": [Integral, None],
+        "n_jobs": [
+            Interval(Integral, 1, None, closed="left"),
+            Interval(Integral, None, -1, closed="right"),
+            None,
+        ],
     }
     forest_: forest.Forest
 
@@ -77,6 +82,10 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
         self.random_state = random_state
         self.n_jobs = n_jobs
 
+    def _threads(self) -> int:
+        jobs = self.n_jobs or 1
+        return jobs if jobs > 0 else max(1, (os.cpu_count() or 1) + 1 + jobs)
+
     def fit(
         self,
         X: ArrayLike,
@@ -90,7 +99,7 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
         them. Raises ValueError for data or parameters that no forest can be fitted to.
         """
         self._validate_params()
-        threads = effective_n_jobs(self.n_jobs)
+        threads = self._threads()
         if sample_weight is not None and multiplicity is not None:
             raise ValueError("sample_weight and multiplicity are the same: give one")
         x: np.ndarray
@@ -127,7 +136,7 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
         x: np.ndarray = validation.validate_data(
             self, X, dtype=np.float32, order="C", reset=False
         )
-        threads = effective_n_jobs(self.n_jobs)
+        threads = self._threads()
         parts = np.array_split(x, min(threads, len(x)))
         forests = [self.forest_] * len(parts)
         return np.concatenate(forest.predict_forests(forests, parts, threads=threads))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.common.compiling import kept
-from bcrl.q.networks.tiles import WIDTH, product
+from bcrl.q.networks.tiles import WIDTH, multiply
 
 #: Moments up to this size become 0: a dead unit's would fade into denormal numbers, on
 #: which processors are many times slower.
@@ -89,7 +89,7 @@ def forward(flat, sizes, room, n):
             alive[:n_in] = room.all[:n_in]
         before[n_in], alive[m], room.n_alive[layer] = np.float32(1.0), n_in, m
         factors = (alive, m + 1, flat[at:], 1, n_out, before)
-        product(after, n, room.all, n_out, *factors)
+        multiply(after, n, room.all, n_out, *factors)
         at += (n_in + 1) * n_out
     return room.units[last + 1]
 
@@ -156,10 +156,10 @@ def backward(flat, first, second, sizes, room, n, adam):
         slopes, below = room.slopes[layer + 1], room.slopes[layer]
         if layer:  # through the weights as they were in `forward`
             factors = (above, n_above, flat[at:end], n_out, 1, slopes)
-            product(below, n, alive, m, *factors)
+            multiply(below, n, alive, m, *factors)
         factors = (room.all, n, before.reshape(-1), before.shape[1], 1, room.turned)
         gradient = room.gradient[: end - at].reshape(n_in + 1, n_out)
-        product(gradient, n_out, alive, m + 1, *factors)
+        multiply(gradient, n_out, alive, m + 1, *factors)
         passed = 0
         for k in range(n_in):
             if alive[passed] == k:

@@ -25,7 +25,7 @@ ZEROS = FLOATS([0.0] * LANES)
 
 
 def _tile(width: int):
-    """An intrinsic: `product` of ROWS rows and `width` columns."""
+    """An intrinsic: `multiply` for ROWS rows and `width` columns."""
 
     def generate(context, b, signature, args):
         def vectors(array, at):
@@ -81,7 +81,7 @@ _wide, _narrow = _tile(WIDTH), _tile(LANES)
 
 
 @njit
-def product(out, columns, rows, n_rows, terms, n_terms, a, across, along, right):
+def multiply(out, columns, rows, n_rows, terms, n_terms, a, across, along, right):
     """out[r] = Σ_t a[r · across + t · along] · right[t] for listed rows r and terms t.
 
     The first `columns` columns are computed, but up to WIDTH are read and written. What

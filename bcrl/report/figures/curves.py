@@ -22,8 +22,8 @@ _LABELS = yaml.safe_load(Path(__file__).with_name("labels.yaml").read_text("utf-
 _SEEDS = {"linewidth": 0.5, "linestyle": (0, (3, 2)), "alpha": 0.45, "zorder": 1.9}
 _TWO_ERRORS = "mean ± 2 standard errors over seeds"
 Band = tuple[np.ndarray, np.ndarray]
-Interval = Callable[[np.ndarray], Band]
-Rows = Callable[[Variant], np.ndarray]
+_Interval = Callable[[np.ndarray], Band]
+_Rows = Callable[[Variant], np.ndarray]
 
 
 def label(family: str, metric: str) -> str:
@@ -55,8 +55,8 @@ def draw_metric(
     axes: Axes,
     methods: Methods,
     metric: str,
-    rows: Rows | None = None,
-    interval: Interval | None = two_errors,
+    rows: _Rows | None = None,
+    interval: _Interval | None = two_errors,
 ) -> None:
     """Every method's mean over seeds with a band, or with all seeds if no `interval`.
     All rows are drawn unless `rows` chooses some. Diverging curves are cut off."""
@@ -100,8 +100,8 @@ def _panels(
     methods: Methods,
     labels: Mapping[str, str],
     size: tuple[float, float],
-    rows: Rows | None = None,
-    interval: Interval | None = two_errors,
+    rows: _Rows | None = None,
+    interval: _Interval | None = two_errors,
 ) -> tuple[Figure, list[Axes]]:
     """Panels of `labels`' metrics, _COLUMNS beside each other, tasks shaded."""
     figure, n = Figure(figsize=size), len(labels)
