@@ -77,8 +77,7 @@ def _move_rows(rows, n, d, depth, start, stop, feature, cut):
             words[b + to], origin[b + to] = word, origin[a + i]
             left += goes_left
             right -= U(1) - goes_left
-        return left
-    if d == U(2):
+    elif d == U(2):
         for i in range(start, stop):
             word = words[a + i]
             goes_left = U(np.int32(word >> shift) <= cut)
@@ -89,19 +88,19 @@ def _move_rows(rows, n, d, depth, start, stop, feature, cut):
                 weight[b + to] = weight[a + i]
             left += goes_left
             right -= U(1) - goes_left
-        return left
-    for i in range(start, stop):
-        goes_left = U(keys[(a + i) * d + U(feature)] <= cut)
-        to = left if goes_left else right
-        for f in range(d):
-            keys[(b + to) * d + f] = keys[(a + i) * d + f]
-        origin[b + to] = origin[a + i]
-        if target.size > 0:
-            target[b + to] = target[a + i]
-        if weight.size > 0:
-            weight[b + to] = weight[a + i]
-        left += goes_left
-        right -= U(1) - goes_left
+    else:
+        for i in range(start, stop):
+            goes_left = U(keys[(a + i) * d + U(feature)] <= cut)
+            to = left if goes_left else right
+            for f in range(d):
+                keys[(b + to) * d + f] = keys[(a + i) * d + f]
+            origin[b + to] = origin[a + i]
+            if target.size > 0:
+                target[b + to] = target[a + i]
+            if weight.size > 0:
+                weight[b + to] = weight[a + i]
+            left += goes_left
+            right -= U(1) - goes_left
     return left
 
 
@@ -291,12 +290,16 @@ def _walk_down(keys, nodes, values, root, at, who, total):
 def predict_forest(nodes, values, first, x):
     """Mean over the trees at x (m, d) float32, as float64 (m,)."""
     trees, (m, d) = first.size - 1, x.shape
-    total, rows = np.zeros(m), _new_rows(x, False, False)
-    keys, stack = rows.keys[: m * d].reshape(m, d), np.empty((m + 1, 4), np.int64)
-    at, who = np.empty((2, m), np.int64)
-    for t in range(trees):
-        if m >= TOGETHER:
+    total = np.zeros(m)
+    if m >= TOGETHER:
+        rows, stack = _new_rows(x, False, False), np.empty((m + 1, 4), np.int64)
+        for t in range(trees):
             _move_down(rows, U(d), nodes, values, first[t], stack, total)
-        else:
+    else:
+        keys, (at, who) = np.empty(x.shape, np.int32), np.empty((2, m), np.int64)
+        for i in range(m):
+            for f in range(d):
+                keys[i, f] = key_of(x[i, f])
+        for t in range(trees):
             _walk_down(keys, nodes, values, first[t], at, who, total)
     return total / trees
