@@ -3,12 +3,9 @@
 Slow imports are made where they are needed, so that Tab and --help don't wait.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from argparse import Namespace
-from typing import TYPE_CHECKING
 
 import hydra
 
@@ -20,9 +17,6 @@ from bcrl.config.describe import describe
 from bcrl.config.hydra_compose import CONF, CONFIG_NAME, register_plugins, searchpath
 from bcrl.errors import BcrlError
 
-if TYPE_CHECKING:
-    from bcrl.config.plan import Plan
-
 FULL_ERROR = "HYDRA_FULL_ERROR"
 
 
@@ -30,8 +24,7 @@ def main() -> None:
     """Console entry point; rejects bad input with one message before any work."""
     ready()
     try:
-        plans = _planned()
-        if plans:
+        if plans := _planned():
             from bcrl.run import runner
 
             runner.run(*plans)
@@ -43,11 +36,8 @@ def main() -> None:
         sys.exit(EXIT_CODE)
 
 
-def _planned() -> list[Plan]:
-    """The plans to run here; none if something is shown, or Slurm has run them.
-
-    Raises BcrlError for whatever goes wrong.
-    """
+def _planned() -> list:
+    """The plans to run here; none if something is shown, or Slurm has run them."""
     try:
         if not sys.argv[1:]:
             show(flags.short())
@@ -59,9 +49,8 @@ def _planned() -> list[Plan]:
     except Exception as error:
         if os.environ.get(FULL_ERROR) == "1":
             raise
-        words = " ".join(str(error).split()) or "no further words"
-        why = f"{type(error).__name__}: {words}; {FULL_ERROR}=1 shows where"
-        raise BcrlError(why) from error
+        why = " ".join(f"{type(error).__name__}: {error}".split())
+        raise BcrlError(f"{why}; {FULL_ERROR}=1 shows where") from error
 
 
 def _shown(asked: Namespace) -> bool:
@@ -83,7 +72,7 @@ def _shown(asked: Namespace) -> bool:
     return True
 
 
-def _checked(asked: Namespace) -> list[Plan]:
+def _checked(asked: Namespace) -> list:
     """The checked plans to run here, after what flags ask for."""
     from bcrl.config import jobs
     from bcrl.run import records, status
@@ -114,9 +103,7 @@ def _show_by_hydra(asked: Namespace) -> None:
     register_plugins()
     folders = searchpath(getattr(asked, "folders", ()))
     sys.argv[1:] = [*flags.for_hydra(asked), *asked.overrides, *folders]
-    shows = hydra.main(
-        version_base="1.3", config_path=str(CONF), config_name=CONFIG_NAME
-    )
+    shows = hydra.main(str(CONF), CONFIG_NAME, version_base="1.3")
     before = os.environ.get(FULL_ERROR, "0")
     os.environ[FULL_ERROR] = "1"  # so that Hydra raises its errors
     try:

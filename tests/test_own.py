@@ -50,18 +50,16 @@ def folder(tmp_path_factory):
 def test_it_runs_from_outside(folder, monkeypatch, command, names):
     monkeypatch.chdir(folder)
     workers = 2 if "regressor" in command else 1  # processes that import the code
+    runs = folder / "runs" / str(len(command))
     small = ["scale=smoke", "seeds.count=2", "progress=none", f"workers={workers}"]
-    small += ["seeds.lockstep=1", f"runs_dir=runs/{len(command)}"]
+    small += ["seeds.lockstep=1", f"runs_dir={runs}"]
     monkeypatch.setattr(sys, "argv", ["bcrl", *shlex.split(command), *small])
     cli.main()
-    runs = folder / "runs" / str(len(command))
     for name in names:
         (made,) = runs.glob(f"smoke/swing_up/{name}/seed_0001.csv")
     for log in runs.glob(".lines/smoke/swing_up/BC-FQI/seed_0001.jsonl"):
-        lines = [json.loads(line) for line in log.read_text().splitlines()]
-        assert [line["return"] for line in lines] == pd.read_csv(made)[
-            "return"
-        ].tolist()
+        lines = [json.loads(line)["return"] for line in log.read_text().splitlines()]
+        assert lines == pd.read_csv(made)["return"].tolist()
     assert (runs / ".lines").exists() == ("logger" in command)
 
 

@@ -65,16 +65,11 @@ def installed(wheel, tmp_path_factory) -> Path:
 def outside(installed, tmp_path):
     """Runs a program of the fresh environment in an empty folder: its two outputs."""
 
-    def run(program: str, *words: str, code: int = 0, **variables) -> tuple[str, str]:
+    def run(program: str, *words: str, code: int = 0) -> tuple[str, str]:
         clean = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
         clean |= {"XDG_CONFIG_HOME": str(tmp_path.parent)}
-        done = subprocess.run(
-            [installed / program, *words],
-            cwd=tmp_path,
-            env=clean | variables,
-            capture_output=True,
-            text=True,
-        )
+        command, kept = [installed / program, *words], {"capture_output": True}
+        done = subprocess.run(command, cwd=tmp_path, env=clean, text=True, **kept)
         assert done.returncode == code, done.stdout + done.stderr
         return done.stdout, done.stderr
 

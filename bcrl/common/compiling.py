@@ -73,18 +73,16 @@ def _source_stamp(locator: Any) -> str:
 def check() -> None:
     """Raise BcrlError if numba may not compile: some loops need it."""
     if numba.config.DISABLE_JIT:
-        why = "bcrl's loops have to be compiled; unset it (env -u NUMBA_DISABLE_JIT)"
-        raise BcrlError(f"NUMBA_DISABLE_JIT={numba.config.DISABLE_JIT}: {why}")
+        raise BcrlError("NUMBA_DISABLE_JIT=1: unset it, bcrl's loops must be compiled")
 
 
 def why_uncached() -> str | None:
     """Why compiled code is lost with the process and what to do; None if it is kept."""
     if not _UNCACHED:
         return None
+    ours = f"neither {os.path.dirname(_UNCACHED[-1])} nor your cache folder is writable"
     return (
-        "compiled code isn't kept, so each start takes a minute longer: neither "
-        f"{os.path.dirname(_UNCACHED[-1])} nor your cache folder can be written; set "
-        "NUMBA_CACHE_DIR to a folder that can"
+        f"each start takes a minute longer: {ours}; set NUMBA_CACHE_DIR to one that is"
     )
 
 

@@ -71,8 +71,9 @@ def module(key: str, name: str, where: str, known: Collection[str] = ()) -> Modu
     if not all(part.isidentifier() for part in where.split(".")):
         raise ConfigError(key, name, "isn't the name of a module")
     if where.partition(".")[0] not in known and not is_trusted(where):
-        why = "a config alone can't name code of yours; type it on the command line, "
-        why += "or pass the config's folder by --config-dir"
+        why = (
+            "a config alone can't name code: type it, or pass its folder (--config-dir)"
+        )
         raise ConfigError(key, name, why)
     try:
         return importlib.import_module(where)
@@ -86,13 +87,10 @@ def fingerprint(config: Mapping[str, Any]) -> str:
     packages = {re.split("[.:]", name)[0] for _, name in named_code(config)} - {"bcrl"}
     digest = hashlib.sha256()
     for package in sorted(packages):
-        spec = importlib.util.find_spec(package)
-        folders = (spec and spec.submodule_search_locations) or ()
-        found = [path for folder in folders for path in Path(folder).rglob("*.py")]
-        if spec and spec.origin and not folders:  # not "built-in"
-            found = [Path(spec.origin)]
-        for path in sorted(filter(Path.is_file, found)):
-            digest.update(path.read_bytes())
+        if spec := importlib.util.find_spec(package):
+            for place in spec.submodule_search_locations or [str(spec.origin)]:
+                for path in sorted([Path(place), *Path(place).rglob("*.py")]):
+                    digest.update(path.read_bytes() if path.is_file() else b"")
     return digest.hexdigest() if packages else ""
 
 

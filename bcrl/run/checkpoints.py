@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Sequence
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,10 @@ from bcrl.run.origin import LIBRARIES
 from bcrl.run.records import is_complete
 
 _SCHEMA = 1  # raised when the content's meaning changes
-#: Our code, read at the start: a file may change on disk while the loaded code stays.
+#: Our code and the libraries that compute, as they are at the start: a file may change
+#: on disk while the loaded code stays.
 _OURS = [p.read_bytes() for p in sorted(Path(__file__).parents[1].rglob("*.py"))]
+_CODE = sha256(b"".join(_OURS) + repr([version(name) for name in LIBRARIES]).encode())
 
 
 def save_checkpoint(
@@ -76,15 +77,8 @@ def _about(plan: Plan) -> dict[str, Any]:
     config = json.dumps(identity(plan.config), sort_keys=True)
     return {
         "schema": _SCHEMA,
-        "code": _code(),
+        "code": _CODE,
         "sources": plan.sources,
         "config": sha256(config.encode()),
         "device": plan.device,
     }
-
-
-@cache
-def _code() -> str:
-    """A hash of this package's code and of the libraries that compute."""
-    versions = [version(name) for name in LIBRARIES]
-    return sha256(b"".join(_OURS) + repr(versions).encode())

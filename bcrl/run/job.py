@@ -2,13 +2,13 @@
 
 import json
 import os
-import resource
 import socket
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from resource import RUSAGE_SELF, getrusage
 from typing import Any
 
 import numpy as np
@@ -32,9 +32,8 @@ from bcrl.run.schedule import Job
 def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
     """Train those of a job's seeds that are free and write each one's files.
 
-    Returns the seeds that failed, and why. An error ends this job alone: its seeds have
-    failed. After a request to `stop` it leaves a checkpoint, from which the next call
-    resumes.
+    Returns the seeds that failed, and why: all of them after an error. After a request
+    to `stop` it leaves a checkpoint, from which the next call resumes.
     """
     plan, seeds = job.plan, job.seeds
     strict = "raise" if plan.config["strict"] else "warn"
@@ -52,9 +51,9 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
             if not seeds or others & set(seeds):
                 return {}
             try:
+                job = replace(job, seeds=seeds, resumes=resumes)
                 with loggers.opened(plan.config, plan.directory, seeds) as log:
-                    training = _Training(replace(job, seeds=seeds), held, log)
-                    failed = training.train(resumes, tick, stop)
+                    failed = _Training(job, held, log).train(tick, stop)
             except Exception as error:
                 for seed in records.pending(plan, seeds):
                     with suppress(BcrlError):  # the folder may be gone
@@ -73,14 +72,13 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
 
 def _reason(error: Exception) -> str:
     if isinstance(error, MemoryError):
-        what = "try fewer workers or seeds.lockstep, or a smaller scale"
-        return " ".join(f"out of memory: {error} ({what})".split())
+        return f"out of memory; try fewer workers or seeds.lockstep; {error}"
     known = isinstance(error, BcrlError)
     return str(error) if known else f"{type(error).__name__}: {error}"
 
 
 class _Training:
-    """The training of seeds whose locks are `held`."""
+    """The training of a job's seeds, whose locks are `held`."""
 
     def __init__(self, job: Job, held: Mapping[int, Lock], log: loggers.Log) -> None:
         self.job, self.held, self.log = job, held, log
@@ -88,19 +86,23 @@ class _Training:
         self.probe: Probe | StepProbe = Probe(seeds, plan.tasks, plan.metrics)
         if plan.family == "DQN":
             self.probe = StepProbe(seeds, plan.tasks)
-        self.batch = SeedBatch(seeds, self.probe.states, job.threads, plan.device)
-        self.run = CurriculumRun(plan.stages, self.batch)
+        batch = SeedBatch(seeds, self.probe.states, job.threads, plan.device)
+        self.run = CurriculumRun(plan.stages, batch)
         self.rows: list[list[dict[str, Any]]] = [[] for _ in seeds]  # of the CSVs
         self.failed: dict[int, str] = {}  # by place in the batch
         self.interruptions = 0
         self._began = _clocks()  # minus what was spent before an interruption
+        self._path = checkpoints.checkpoint_path(plan, seeds)
+        if job.resumes:
+            stored = read_content(self._path, self.run.given, plan.device)
+            self.run = CurriculumRun(plan.stages, batch, stored["past"])
+            self.probe.kept, self.failed = stored["kept"], stored["failed"]
+            self.rows, self.interruptions = json.loads(stored["rows"]), stored["stops"]
+            self._began -= stored["spent"]
+            log(self.probe.index, self.rows)
 
-    def train(
-        self, resumes: bool, tick: Callable[[Tick], None], stop: Stop
-    ) -> dict[int, str]:
-        """Train, from the checkpoint if one exists; the seeds that failed, and why."""
-        if resumes:
-            self._resume()
+    def train(self, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
+        """Train to the end or until `stop`; the seeds that failed, and why."""
         host = {"host": socket.gethostname(), "pid": os.getpid()}
         new = records.pending(self.plan, self.seeds)
         for seed in new:
@@ -122,7 +124,7 @@ class _Training:
                 self._save()
                 saved = time.monotonic()
         failed = self._record(new)
-        checkpoints.checkpoint_path(self.plan, self.seeds).unlink(missing_ok=True)
+        self._path.unlink(missing_ok=True)
         return failed
 
     def measure(self, snapshot: Snapshot) -> None:
@@ -138,24 +140,12 @@ class _Training:
         for place, why in self.probe.failed.items():
             self.failed.setdefault(place, f"{why} at {index} {snapshot.count}")
 
-    def _resume(self) -> None:
-        """Continue from the batch's checkpoint."""
-        path = checkpoints.checkpoint_path(self.plan, self.seeds)
-        stored = read_content(path, self.run.given, self.plan.device)
-        self.run = CurriculumRun(self.plan.stages, self.batch, stored["past"])
-        self.probe.kept, self.failed = stored["kept"], stored["failed"]
-        self.rows, self.interruptions = json.loads(stored["rows"]), stored["stops"]
-        self._began -= stored["spent"]
-        self.log(self.probe.index, self.rows)
-
     def _save(self) -> None:
-        """Write the batch's checkpoint."""
         content = {
             "past": self.run.state,
             "kept": self.probe.kept,
             "failed": self.failed,
-            # Many small values: one text takes less time and space.
-            "rows": json.dumps(self.rows),
+            "rows": json.dumps(self.rows),  # faster and smaller as one text
             "stops": self.interruptions,
             "spent": _clocks() - self._began,
         }
@@ -172,7 +162,6 @@ class _Training:
         """Write the files of the `new` seeds; those that diverged, and why."""
         plan, failed = self.plan, {}
         wall, cpu = map(float, _clocks() - self._began)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         facts = self.probe.facts() | {
             "wall_seconds": wall,
             "cpu_seconds": cpu / len(self.seeds),  # this seed's share
@@ -180,7 +169,7 @@ class _Training:
             "lockstep": list(self.seeds),
             "device": plan.device,
             "success": str(success_of(plan.target)),
-            "peak_memory_mib": peak / 1024,
+            "peak_memory_mib": getrusage(RUSAGE_SELF).ru_maxrss / 1024,
             **self.job.origin,
         }
         for place, seed in enumerate(self.seeds):

@@ -20,7 +20,6 @@ from bcrl.results.layout import COMPLETE, CONFIG, FAILED, RUNNING, seed_path
 from bcrl.results.read import Finding, read_document, read_recorded
 from bcrl.run import locks
 
-_MALFORMED = (ValueError, LookupError, TypeError, AttributeError, yaml.YAMLError)
 INTERRUPTED, DAMAGED, WAITING = "interrupted", "damaged", "waiting"
 #: Where a seed may stand.
 STATES = (COMPLETE, RUNNING, INTERRUPTED, FAILED, DAMAGED, WAITING)
@@ -39,13 +38,13 @@ def check_directory(plan: Plan) -> None:
         changed = differences(yaml.safe_load(present.read_bytes()), plan.config)
     except FileNotFoundError:
         return
-    except (OSError, *_MALFORMED) as error:
+    except Exception as error:  # whatever the file holds
         raise BcrlError(f"{present} can't be read ({error}); move it away") from error
     if changed:
         lines = [f"  {k}: there {a!r}, here {b!r}" for k, (a, b) in changed.items()]
-        lines.insert(0, f"{directory} holds runs of a different config:")
-        lines.append("choose another tag (tag=NAME) or runs_dir, or remove the folder")
-        raise BcrlError("\n".join(lines))
+        todo = "choose another tag (tag=NAME) or runs_dir, or remove the folder"
+        why = f"{directory} holds runs of a different config:"
+        raise BcrlError("\n".join([why, *lines, todo]))
 
 
 def make_run_directory(plan: Plan) -> None:
@@ -85,13 +84,8 @@ def state(directory: Path, seed: int) -> tuple[str, str]:
     return INTERRUPTED if noted == RUNNING else noted, why
 
 
-def states(directory: Path, seeds: Sequence[int]) -> dict[int, tuple[str, str]]:
-    """The `state` of each seed."""
-    return {seed: state(directory, seed) for seed in seeds}
-
-
 def problems(name: str, found: Mapping[int, tuple[str, str]]) -> list[str]:
-    """Lines about failed and damaged seeds, given the `states` of a variant's seeds."""
+    """Lines about failed and damaged seeds, given the `state` of each seed."""
     return by_reason(name, {s: f"{x}: {why}" for s, (x, why) in found.items() if why})
 
 
@@ -133,12 +127,12 @@ def write_seed(
     lines = [",".join(rows[0])]
     # A value that is missing (NaN) is an empty cell, as in the report's tables.
     lines += [",".join(repr(x) if x == x else "" for x in row.values()) for row in rows]
-    text, packed = "\n".join(lines) + "\n", io.BytesIO()
-    np.savez(packed, **dict(arrays))
-    data = packed.getvalue()
-    npz, csv = (seed_path(plan.directory, seed, suffix) for suffix in ("npz", "csv"))
-    files.write_atomically(npz, lambda file: file.write(data))
-    files.write_text(csv, text)
+    np.savez(packed := io.BytesIO(), **dict(arrays))
+    data, text = packed.getvalue(), "\n".join([*lines, ""])
+    files.write_atomically(
+        seed_path(plan.directory, seed, "npz"), lambda file: file.write(data)
+    )
+    files.write_text(seed_path(plan.directory, seed, "csv"), text)
     hashes = {"npz": files.sha256(data), "csv": files.sha256(text.encode())}
     columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     found = {"sha256": hashes, "diverging": diverging(columns)}

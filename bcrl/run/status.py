@@ -57,7 +57,8 @@ def status(arguments: Namespace) -> str:
     rows: dict[str, list[int]] = {}
     lines: list[str] = []
     for directory, seeds in asked:
-        name, found = " ".join(directory.parts[-3:]), records.states(directory, seeds)
+        name = " ".join(directory.parts[-3:])
+        found = {seed: records.state(directory, seed) for seed in seeds}
         lines += records.problems(name, found)
         found |= {s: (RUNNING, "") for s in seeds if locks.is_held(directory, s)}
         states = [state for state, _ in found.values()]

@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from multiprocessing import connection, resource_tracker
 from typing import Any
 
@@ -26,10 +27,15 @@ def do_jobs(
 ) -> Iterator[tuple[int, Any]]:
     """The jobs' numbers and results as they come, done in order by `workers` processes.
 
-    `report` takes a job's number and its reports. If a process dies, its job's result
-    is a text that says so. After a request to stop, running jobs stop, too, and no
-    other begins.
+    One worker is this process. `report` takes a job's number and its reports. If a
+    process dies, its job's result is a text that says so. After a request to stop,
+    running jobs stop, too, and no other begins.
     """
+    if workers == 1:
+        for number, job in enumerate(jobs):
+            if not stop.requested:
+                yield number, do(job, partial(report, number), stop)
+        return
     pool = dict(_started(do) for _ in range(min(workers, len(jobs))))
     waiting, stopped = list(range(len(jobs))), False
     doing: dict[Any, int] = {}  # the number of a job, by its process's pipe

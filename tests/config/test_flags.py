@@ -183,7 +183,7 @@ def test_the_overview_tells_states_apart_by_locks_and_files(tmp_path):
     p = plan(*options, "seeds.count=6")
     for seed, status in ((2, "running"), (3, "running"), (4, "failed: key=1: no")):
         records.write_status(p, seed, status, {})
-    computing = locks.seed_lock(p.directory, 2)
+    computing = locks.Lock(p.directory, "seed_0002")
     assert computing.acquire()
     before = everything(tmp_path)
     for asked in (

@@ -138,7 +138,7 @@ def test_other_seeds_than_a_checkpoints_start_by_themselves(tmp_path):
 
 
 def test_a_seed_has_one_holder_who_is_named_and_whose_death_frees_it(tmp_path):
-    lock, other = (locks.seed_lock(tmp_path, 7) for _ in range(2))
+    lock, other = (locks.Lock(tmp_path, "seed_0007") for _ in range(2))
     assert lock.acquire() and not other.acquire() and locks.is_held(tmp_path, 7)
     assert str(os.getpid()) in other.holder()
     lock.release()
@@ -162,7 +162,7 @@ def test_a_file_system_without_locks_is_rejected(tmp_path, monkeypatch, code):
 
     monkeypatch.setattr(locks.fcntl, "flock", flock)
     with pytest.raises(BcrlError, match=f"runs_dir: .*{tmp_path}.*words of the system"):
-        locks.seed_lock(tmp_path, 7).acquire()
+        locks.Lock(tmp_path, "seed_0007").acquire()
 
 
 # --- real processes ---
