@@ -24,33 +24,26 @@ def main() -> None:
     """Console entry point; rejects bad input with one message before any work."""
     ready()
     try:
-        if plans := _planned():
-            from bcrl.run import runner
-
-            runner.run(*plans)
-    except BcrlError as error:
-        say(f"bcrl: {error}")
-        sys.exit(error.exit_code)
-    except (Interrupted, KeyboardInterrupt):
-        say("bcrl: interrupted; run the same command again to resume")
-        sys.exit(EXIT_CODE)
-
-
-def _planned() -> list:
-    """The plans to run here; none if something is shown, or Slurm has run them."""
-    try:
         if not sys.argv[1:]:
             show(flags.short())
             sys.exit(2)
         asked = flags.arguments()
-        return [] if _shown(asked) else _checked(asked)
-    except BcrlError:
-        raise
+        if not _shown(asked) and (plans := _checked(asked)):
+            from bcrl.run import runner
+
+            runner.run(*plans)
+    except (Interrupted, KeyboardInterrupt):
+        say("bcrl: interrupted; run the same command again to resume")
+        sys.exit(EXIT_CODE)
+    except BcrlError as error:
+        say(f"bcrl: {error}")
+        sys.exit(error.exit_code)
     except Exception as error:
         if os.environ.get(FULL_ERROR) == "1":
             raise
         why = " ".join(f"{type(error).__name__}: {error}".split())
-        raise BcrlError(f"{why}; {FULL_ERROR}=1 shows where") from error
+        say(f"bcrl: {why}; {FULL_ERROR}=1 shows where")
+        sys.exit(BcrlError.exit_code)
 
 
 def _shown(asked: Namespace) -> bool:
@@ -73,7 +66,7 @@ def _shown(asked: Namespace) -> bool:
 
 
 def _checked(asked: Namespace) -> list:
-    """The checked plans to run here, after what flags ask for."""
+    """The checked plans to run here; none after a flag's or Slurm's work."""
     from bcrl.config import jobs
     from bcrl.run import records, status
 

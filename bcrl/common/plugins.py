@@ -19,11 +19,10 @@ from bcrl.errors import ConfigError
 
 VARIABLE = "BCRL_TRUST"  # of this process and the workers that it starts
 #: The keys whose values may name code.
-NAMING = (
-    *("env.name", "env.id", "env.observation", "env.tasks.observation"),
-    *("env.wrappers", "env.tasks.wrappers", "algorithm.name"),
-    *("algorithm.regressor.name", "curriculum.name", "transfer.name", "logger.name"),
-)
+NAMING = ("env.name", "env.id", "env.observation", "env.tasks.observation")
+NAMING += ("env.wrappers", "env.tasks.wrappers", "algorithm.name")
+NAMING += ("algorithm.regressor.name", "curriculum.name", "transfer.name")
+NAMING += ("logger.name",)
 
 
 def named_code(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

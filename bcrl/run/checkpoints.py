@@ -74,11 +74,6 @@ def _stored(directory: Path) -> dict[Path, dict[str, Any]]:
 
 def _about(plan: Plan) -> dict[str, Any]:
     """The facts that must be equal for a run to resume from a checkpoint."""
-    config = json.dumps(identity(plan.config), sort_keys=True)
-    return {
-        "schema": _SCHEMA,
-        "code": _CODE,
-        "sources": plan.sources,
-        "config": sha256(config.encode()),
-        "device": plan.device,
-    }
+    config = sha256(json.dumps(identity(plan.config), sort_keys=True).encode())
+    about = {"schema": _SCHEMA, "code": _CODE, "sources": plan.sources}
+    return about | {"config": config, "device": plan.device}

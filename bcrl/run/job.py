@@ -128,12 +128,11 @@ class _Training:
         return failed
 
     def measure(self, snapshot: Snapshot) -> None:
-        """Append a row per seed; the last row of a seed may show its failure."""
+        """Append a row per seed; a failed seed's last row shows the failure."""
         index, where = self.probe.index, self.probe.place(snapshot)
-        new = [
-            [] if place in self.failed else [where | metrics]
-            for place, metrics in enumerate(self.probe.measure(snapshot))
-        ]
+        new = [[where | metrics] for metrics in self.probe.measure(snapshot)]
+        for place in self.failed:
+            new[place] = []
         self.log(index, new)
         for rows, added in zip(self.rows, new, strict=True):
             rows += added
@@ -141,14 +140,10 @@ class _Training:
             self.failed.setdefault(place, f"{why} at {index} {snapshot.count}")
 
     def _save(self) -> None:
-        content = {
-            "past": self.run.state,
-            "kept": self.probe.kept,
-            "failed": self.failed,
-            "rows": json.dumps(self.rows),  # faster and smaller as one text
-            "stops": self.interruptions,
-            "spent": _clocks() - self._began,
-        }
+        rows = json.dumps(self.rows)  # faster and smaller as one text
+        content = {"past": self.run.state, "kept": self.probe.kept, "rows": rows}
+        content |= {"failed": self.failed, "stops": self.interruptions}
+        content |= {"spent": _clocks() - self._began}
         self._check_locks()
         checkpoints.save_checkpoint(self.plan, self.seeds, content, self.run.given)
 
@@ -162,16 +157,12 @@ class _Training:
         """Write the files of the `new` seeds; those that diverged, and why."""
         plan, failed = self.plan, {}
         wall, cpu = map(float, _clocks() - self._began)
-        facts = self.probe.facts() | {
-            "wall_seconds": wall,
-            "cpu_seconds": cpu / len(self.seeds),  # this seed's share
-            "interruptions": self.interruptions,
-            "lockstep": list(self.seeds),
-            "device": plan.device,
-            "success": str(success_of(plan.target)),
-            "peak_memory_mib": getrusage(RUSAGE_SELF).ru_maxrss / 1024,
-            **self.job.origin,
-        }
+        share = cpu / len(self.seeds)  # this seed's
+        facts = self.probe.facts() | {"wall_seconds": wall, "cpu_seconds": share}
+        facts |= {"interruptions": self.interruptions, "lockstep": list(self.seeds)}
+        facts |= {"device": plan.device, "success": str(success_of(plan.target))}
+        facts |= {"peak_memory_mib": getrusage(RUSAGE_SELF).ru_maxrss / 1024}
+        facts |= self.job.origin
         for place, seed in enumerate(self.seeds):
             if seed not in new:
                 continue

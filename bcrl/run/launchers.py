@@ -134,8 +134,7 @@ def _wait(arrays: Sequence[str], telling: bool, stop: Stop) -> None:
             raise Unattended(f"{text}; {' '.join(arrays)} may still run (see --status)")
         if now != before and (telling or why):
             say(f"Slurm: {now}")
-        pause = 1.0 if now != before else min(30.0, 1.2 * pause)
-        before = now
+        pause, before = 1.0 if now != before else min(30.0, 1.2 * pause), now
         time.sleep(pause)
     if arrays:
         say(f"bcrl: Slurm continues; `scancel {' '.join(arrays)}` ends the jobs")
@@ -144,10 +143,9 @@ def _wait(arrays: Sequence[str], telling: bool, stop: Stop) -> None:
 
 def _squeue(*options: str) -> tuple[str | None, str]:
     """Slurm's queue, or None and why squeue fails, as while Slurm restarts."""
-    command = ["squeue", "--noheader", *options]
-    kept: dict[str, Any] = {"capture_output": True, "errors": "replace"}
+    words = ["squeue", "--noheader", *options]
     try:
-        done = subprocess.run(command, timeout=60, **kept)
+        done = subprocess.run(words, capture_output=True, timeout=60, errors="replace")
     except (OSError, subprocess.TimeoutExpired) as error:
         return None, str(error)
     if done.returncode:

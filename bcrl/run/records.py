@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from bcrl.common import files
 from bcrl.common.divergence import diverging
@@ -116,18 +115,13 @@ def write_status(plan: Plan, seed: int, status: str, facts: Plain) -> None:
 
 
 def write_seed(
-    plan: Plan,
-    seed: int,
-    status: str,
-    rows: Sequence[Mapping[str, int | float]],
-    arrays: Mapping[str, NDArray],
-    facts: Plain,
+    plan: Plan, seed: int, status: str, rows: list[Plain], arrays: Plain, facts: Plain
 ) -> None:
     """Write a seed's CSV, NPZ and, last, its JSON with the hashes of both."""
     lines = [",".join(rows[0])]
     # A value that is missing (NaN) is an empty cell, as in the report's tables.
     lines += [",".join(repr(x) if x == x else "" for x in row.values()) for row in rows]
-    np.savez(packed := io.BytesIO(), **dict(arrays))
+    np.savez(packed := io.BytesIO(), **arrays)
     data, text = packed.getvalue(), "\n".join([*lines, ""])
     files.write_atomically(
         seed_path(plan.directory, seed, "npz"), lambda file: file.write(data)

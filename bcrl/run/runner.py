@@ -4,7 +4,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 
-from bcrl.common import compiling
 from bcrl.common.signals import Interrupted, Stop
 from bcrl.common.terminal import say
 from bcrl.config.plan import Plan
@@ -34,8 +33,6 @@ def run(*plans: Plan) -> None:
     """
     quiet = plans[0].config["progress"] == "none"
     plans, stop, failed = tuple(merged(plans)), Stop(), Failures()
-    if not quiet and (why := compiling.why_uncached()):
-        say(why)
     with stop.on_signals():
         for plan in plans:
             _prepare(plan, quiet)

@@ -36,13 +36,11 @@ def merged(plans: Sequence[Plan]) -> list[Plan]:
     together: dict[Path, Plan] = {}
     for plan in plans:
         before = together.get(plan.directory, plan)
-        commands = dict.fromkeys([*before.command.splitlines(), plan.command])
-        together[plan.directory] = replace(
-            before,
-            asked=tuple(dict.fromkeys(before.asked + plan.asked)),
-            seeds=tuple(dict.fromkeys(before.seeds + plan.seeds)),
-            command="\n".join(commands),
-        )
+        asked = tuple(dict.fromkeys(before.asked + plan.asked))
+        seeds = tuple(dict.fromkeys(before.seeds + plan.seeds))
+        command = "\n".join(dict.fromkeys([*before.command.splitlines(), plan.command]))
+        both = replace(before, asked=asked, seeds=seeds, command=command)
+        together[plan.directory] = both
     return list(together.values())
 
 

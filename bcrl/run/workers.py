@@ -19,11 +19,7 @@ Do = Callable[[Any, Callable[[Any], None], Any], Any]
 
 
 def do_jobs(
-    do: Do,
-    jobs: Sequence[Any],
-    workers: int,
-    report: Callable[[int, Any], None],
-    stop: Stop,
+    do: Do, jobs: Sequence, workers: int, report: Callable[[int, Any], None], stop: Stop
 ) -> Iterator[tuple[int, Any]]:
     """The jobs' numbers and results as they come, done in order by `workers` processes.
 
@@ -95,9 +91,8 @@ def _send(pipe: Any, message: Any) -> None:
 
 def cores() -> int:
     """Cores that this process may use; not every Slurm binds a job to its own."""
-    there = os.cpu_count() or 1
-    if hasattr(os, "sched_getaffinity"):
-        there = len(os.sched_getaffinity(0))
+    affinity = getattr(os, "sched_getaffinity", None)
+    there = len(affinity(0)) if affinity else os.cpu_count() or 1
     return min(there, count("SLURM_CPUS_PER_TASK") or there)
 
 
