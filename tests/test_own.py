@@ -27,6 +27,7 @@ RESULTS = {
     "algorithm=patient": ("BC-PATIENT",),
     "logger=lines": ("BC-FQI",),
 }
+CASES = list(zip(COMMANDS, RESULTS.values(), strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -44,9 +45,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("command", "names"), list(zip(COMMANDS, RESULTS.values(), strict=True))
-)
+@pytest.mark.parametrize(("command", "names"), CASES)
 def test_it_runs_from_outside(folder, monkeypatch, command, names):
     monkeypatch.chdir(folder)
     workers = 2 if "regressor" in command else 1  # processes that import the code
