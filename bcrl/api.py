@@ -122,10 +122,8 @@ def run(
     rows, length = [], sum(stage.learner.length for stage in stages)
     with tqdm(total=length, unit=probe.index, disable=not progress) as bar:
         for snapshot in learn(stages, batch):
-            measured, where = probe.measure(snapshot), probe.place(snapshot)
-            rows += [
-                {"seed": s} | where | m for s, m in zip(seeds, measured, strict=True)
-            ]
+            for seed, row in zip(seeds, probe.measure(snapshot), strict=True):
+                rows.append({"seed": seed} | probe.place(snapshot) | row)
             if lost := [f"seed {seeds[s]}: {why}" for s, why in probe.failed.items()]:
                 raise BcrlError(f"at {probe.index} {snapshot.count}: {', '.join(lost)}")
             bar.set_description_str(f"task {snapshot.stage.task}", refresh=False)

@@ -47,8 +47,7 @@ def trust(name: str) -> None:
     """Let configs name the package that `name` begins with, here and in workers."""
     package = re.split("[.:]", name)[0]
     if not is_trusted(package):
-        before = os.environ.get(VARIABLE, "")
-        os.environ[VARIABLE] = f"{before},{package}".lstrip(",")
+        os.environ[VARIABLE] = f"{os.environ.get(VARIABLE, '')},{package}".lstrip(",")
 
 
 def is_foreign(name: str, ours: Collection[str]) -> bool:

@@ -13,7 +13,7 @@ from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
 from bcrl.results.layout import CHECKPOINT
 from bcrl.run.origin import LIBRARIES
-from bcrl.run.records import is_complete
+from bcrl.run.records import pending
 
 _SCHEMA = 1  # raised when the content's meaning changes
 #: Our code and the libraries that compute, as they are at the start: a file may change
@@ -56,7 +56,7 @@ def remove_done(plan: Plan) -> None:
     """Remove the checkpoints whose seeds are all complete."""
     for path, about in _stored(plan.directory).items():
         seeds = about.get("seeds", ())
-        if seeds and all(is_complete(plan.directory, seed) for seed in seeds):
+        if seeds and not pending(plan, seeds):
             path.unlink(missing_ok=True)
 
 

@@ -5,7 +5,7 @@ import os
 import socket
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from resource import RUSAGE_SELF, getrusage
@@ -23,8 +23,7 @@ from bcrl.learning.rollout import success_of
 from bcrl.learning.stage import CurriculumRun, SeedBatch, Snapshot
 from bcrl.results import loggers
 from bcrl.results.layout import COMPLETE, RUNNING
-from bcrl.run import checkpoints, records
-from bcrl.run.locks import Lock, claimed
+from bcrl.run import checkpoints, locks, records
 from bcrl.run.progress import Tick
 from bcrl.run.schedule import Job
 
@@ -40,7 +39,7 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
     try:
         records.make_run_directory(plan)
         with (
-            claimed(plan.directory, job.seeds) as held,
+            locks.claimed(plan.directory, seeds) as held,
             np.errstate(divide=strict, over=strict, invalid=strict),
         ):
             begun = checkpoints.batches(plan)
@@ -71,8 +70,6 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
 
 
 def _reason(error: Exception) -> str:
-    if isinstance(error, MemoryError):
-        return f"out of memory; try fewer workers or seeds.lockstep; {error}"
     known = isinstance(error, BcrlError)
     return str(error) if known else f"{type(error).__name__}: {error}"
 
@@ -80,7 +77,7 @@ def _reason(error: Exception) -> str:
 class _Training:
     """The training of a job's seeds, whose locks are `held`."""
 
-    def __init__(self, job: Job, held: Mapping[int, Lock], log: loggers.Log) -> None:
+    def __init__(self, job: Job, held: dict[int, locks.Lock], log: loggers.Log) -> None:
         self.job, self.held, self.log = job, held, log
         self.plan, self.seeds = plan, seeds = job.plan, job.seeds
         self.probe: Probe | StepProbe = Probe(seeds, plan.tasks, plan.metrics)
@@ -150,8 +147,7 @@ class _Training:
     def _check_locks(self) -> None:
         """BcrlError if the folder, and with it the locks, was taken away."""
         if not all(lock.holds() for lock in self.held.values()):
-            text = "was removed or replaced while its seeds were being computed"
-            raise BcrlError(f"{self.plan.directory} {text}; run the command again")
+            raise BcrlError(f"{self.plan.directory} was removed or replaced; run again")
 
     def _record(self, new: Sequence[int]) -> dict[int, str]:
         """Write the files of the `new` seeds; those that diverged, and why."""

@@ -130,8 +130,7 @@ def _wait(arrays: Sequence[str], telling: bool, stop: Stop) -> None:
                 return
             now = ", ".join(f"{n} {s.lower()}" for s, n in sorted(states.items()))
         elif time.monotonic() > answered + _PATIENCE:
-            text = f"squeue has failed for {_PATIENCE / 60:.0f} minutes: {why}"
-            raise Unattended(f"{text}; {' '.join(arrays)} may still run (see --status)")
+            raise Unattended(f"{' '.join(arrays)} may still run; squeue fails: {why}")
         if now != before and (telling or why):
             say(f"Slurm: {now}")
         pause, before = 1.0 if now != before else min(30.0, 1.2 * pause), now

@@ -1,7 +1,6 @@
 """Locks on seeds: one process computes a seed, on one machine or a shared file system.
 
 The kernel holds them (flock, through filelock), so a process that dies loses its locks.
-A lock file's text names the holder, for people to read.
 """
 
 import errno
@@ -88,8 +87,7 @@ def claimed(folder: Path, seeds: Sequence[int]) -> Iterator[dict[int, Lock]]:
     with ExitStack() as stack:
         held = {}
         for seed in seeds:
-            lock = Lock(folder, seed_name(seed))
-            if lock.acquire():
+            if (lock := Lock(folder, seed_name(seed))).acquire():
                 held[seed] = lock
                 stack.callback(lock.release)
         yield held
@@ -98,6 +96,5 @@ def claimed(folder: Path, seeds: Sequence[int]) -> Iterator[dict[int, Lock]]:
 def tidy(folder: Path) -> None:
     """Remove lock files and half-written files of processes that died."""
     for path in folder.glob(".*.lock"):
-        lock = Lock(folder, path.name.removeprefix(".").removesuffix(".lock"))
-        if lock.acquire():
+        if (lock := Lock(folder, path.stem.removeprefix("."))).acquire():
             lock.release()

@@ -23,8 +23,7 @@ def run_origin() -> dict[str, Any]:
     versions |= {name: version(name) for name in LIBRARIES}
     cpus = Path("/proc/cpuinfo")  # of Linux
     text = cpus.read_text("utf-8", "replace") if os.access(cpus, os.R_OK) else ""
-    processor = re.search(r"model name\s*: (.*)", text)
-    cpu = processor[1] if processor else platform.processor()
+    cpu = re.findall(r"model name\s*: (.*)", text) or [platform.processor()]
     # An installed package may lie in the checkout of another project.
     ours = _git("ls-files", "--error-unmatch", "__init__.py")
     dirty, system = bool(ours and _git("status", "--porcelain")), platform.platform()
@@ -32,7 +31,7 @@ def run_origin() -> dict[str, Any]:
         "command": shlex.join([Path(program).name, *words]),
         "versions": versions,
         "git": {"revision": ours and _git("rev-parse", "HEAD"), "dirty": dirty},
-        "machine": {"system": system, "processor": cpu, "cores": os.cpu_count()},
+        "machine": {"system": system, "processor": cpu[0], "cores": os.cpu_count()},
     }
 
 

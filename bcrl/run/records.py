@@ -28,10 +28,9 @@ def check_directory(plan: Plan) -> None:
     """Raise BcrlError if the folder can't be written or has another config's runs."""
     directory = plan.directory
     existing = next(p for p in (directory, *directory.absolute().parents) if p.exists())
-    if not existing.is_dir():
-        raise BcrlError(f"runs_dir: {existing} is a file; name another folder")
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise BcrlError(f"runs_dir: no permission to write in {existing}")
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        why = "is no folder, or there is no permission to write in it"
+        raise BcrlError(f"runs_dir: {existing} {why}; name another")
     present = directory / CONFIG
     try:
         changed = differences(yaml.safe_load(present.read_bytes()), plan.config)
@@ -56,8 +55,8 @@ def make_run_directory(plan: Plan) -> None:
     try:
         check_directory(plan)
         if not (directory / CONFIG).exists():
-            kept = identity(plan.config)
-            text = yaml.safe_dump(kept, sort_keys=False, allow_unicode=True)
+            options = {"sort_keys": False, "allow_unicode": True}
+            text = yaml.safe_dump(identity(plan.config), **options)
             files.write_text(directory / CONFIG, text)
     finally:
         lock.release()
@@ -88,15 +87,10 @@ def problems(name: str, found: Mapping[int, tuple[str, str]]) -> list[str]:
     return by_reason(name, {s: f"{x}: {why}" for s, (x, why) in found.items() if why})
 
 
-def is_complete(directory: Path, seed: int) -> bool:
-    """Whether a seed is complete and its files are unchanged."""
-    return state(directory, seed)[0] == COMPLETE
-
-
 def pending(plan: Plan, seeds: Iterable[int] | None = None) -> list[int]:
     """The plan's seeds, or those of `seeds`, that are not complete yet."""
     asked = plan.seeds if seeds is None else seeds
-    return [seed for seed in asked if not is_complete(plan.directory, seed)]
+    return [seed for seed in asked if state(plan.directory, seed)[0] != COMPLETE]
 
 
 def read_facts(directory: Path, seed: int) -> Plain:
@@ -123,10 +117,9 @@ def write_seed(
     lines += [",".join(repr(x) if x == x else "" for x in row.values()) for row in rows]
     np.savez(packed := io.BytesIO(), **arrays)
     data, text = packed.getvalue(), "\n".join([*lines, ""])
-    files.write_atomically(
-        seed_path(plan.directory, seed, "npz"), lambda file: file.write(data)
-    )
-    files.write_text(seed_path(plan.directory, seed, "csv"), text)
+    npz, csv = (seed_path(plan.directory, seed, suffix) for suffix in ("npz", "csv"))
+    files.write_atomically(npz, lambda file: file.write(data))
+    files.write_text(csv, text)
     hashes = {"npz": files.sha256(data), "csv": files.sha256(text.encode())}
     columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     found = {"sha256": hashes, "diverging": diverging(columns)}

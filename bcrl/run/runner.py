@@ -11,7 +11,6 @@ from bcrl.errors import BcrlError
 from bcrl.evaluation import oracle
 from bcrl.results.layout import COMPLETE, seed_name
 from bcrl.run import checkpoints, costs, job, locks, records, status
-from bcrl.run.locks import Lock
 from bcrl.run.origin import run_origin
 from bcrl.run.progress import Progress
 from bcrl.run.schedule import Failures, Job, merged, ordered
@@ -53,10 +52,9 @@ def check_complete(plans: Sequence[Plan]) -> None:
     """Raise SeedsFailed, as `run`, for seeds that other processes left incomplete."""
     plans, failed = merged(plans), Failures()
     for plan in plans:
-        for seed in plan.seeds:
-            state, why = records.state(plan.directory, seed)
-            if state != COMPLETE:
-                failed.setdefault(plan.directory, {})[seed] = why or state
+        found = {seed: records.state(plan.directory, seed) for seed in plan.seeds}
+        lost = {s: why or x for s, (x, why) in found.items() if x != COMPLETE}
+        failed[plan.directory] = lost
     _check(plans, failed)
 
 
@@ -69,9 +67,8 @@ def _check(plans: Sequence[Plan], failed: Failures) -> None:
         commands += [f"  {line}" for line in plan.command.splitlines() if reasons]
     if number:
         first = f"{number} seed{'s' * (number > 1)} failed, all others are complete:"
-        raise SeedsFailed(
-            "\n".join([first, *lines, "to run just this again:", *commands])
-        )
+        text = [first, *lines, "to run just this again:", *commands]
+        raise SeedsFailed("\n".join(text))
 
 
 def _prepare(plan: Plan, quiet: bool) -> None:
@@ -124,7 +121,7 @@ def _is_free(work: Job) -> bool:
 def _wait(jobs: Sequence[Job], quiet: bool, stop: Stop) -> None:
     """Wait until one of the jobs that other processes do is free."""
     if not quiet:
-        lock = Lock(jobs[0].plan.directory, seed_name(jobs[0].seeds[0]))
+        lock = locks.Lock(jobs[0].plan.directory, seed_name(jobs[0].seeds[0]))
         say(f"waiting for {len(jobs)} jobs: {lock.path} is held by {lock.holder()}")
     while not (stop.requested or any(map(_is_free, jobs))):
         time.sleep(0.2)

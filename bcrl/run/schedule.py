@@ -71,6 +71,5 @@ def ordered(plans: Sequence[Plan], failed: Failures) -> list[Job]:
     for plan, seeds in new:
         least = -(-len(seeds) // plan.lockstep)  # batches of at most `lockstep` seeds
         number = min(-(-least // spread) * spread, len(seeds))  # even for the workers
-        parts = np.array_split(seeds, number)
-        jobs += [Job(plan, tuple(part.tolist())) for part in parts]
+        jobs += [Job(plan, tuple(p.tolist())) for p in np.array_split(seeds, number)]
     return sorted(jobs, key=lambda job: -job.seconds)

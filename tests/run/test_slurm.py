@@ -44,7 +44,7 @@ REJECTED = {
     None: (2, "hydra/launcher=slurm: there is no sbatch"),
     0: (2, "none was submitted.*QOSMaxSubmit"),
     1: (3, "QOSMaxSubmit.*scancel 4711"),
-    2: (3, "slurm_load_jobs error.*4711"),
+    2: (3, "4711 may still run.*slurm_load_jobs error"),
 }
 
 
