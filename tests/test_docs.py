@@ -17,7 +17,6 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / x for x in ("README.md", "CONTRIBUTING.md", "bench/README.md")]
 PAGES += sorted(DOCS.rglob("*.md"))
 TEXT = {page: page.read_text("utf-8") for page in PAGES}
-#: Commands that compose many jobs, or try out simulators.
 SLOW = r"experiment=|env=gymnasium|env=mountain_car"
 #: Made when the site is built.
 GENERATED = DOCS / "reference" / "config.md"

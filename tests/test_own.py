@@ -60,13 +60,3 @@ def test_it_runs_from_outside(folder, monkeypatch, command, names):
         lines = [json.loads(line)["return"] for line in log.read_text().splitlines()]
         assert lines == pd.read_csv(made)["return"].tolist()
     assert (runs / ".lines").exists() == ("logger" in command)
-
-
-def test_a_config_alone_may_not_name_the_code(folder, monkeypatch, tmp_path, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
-    (tmp_path / "bcrl").symlink_to(folder / "conf")  # found, but not named
-    monkeypatch.setattr(sys, "argv", ["bcrl", "env=swing_up", "--dry-run"])
-    with pytest.raises(SystemExit, match="2"):
-        cli.main()
-    assert "env.name=mine.swing_up" in capsys.readouterr().err

@@ -74,8 +74,7 @@ def check() -> None:
 
 caching.IndexDataCacheFile = Files
 caching._SourceFileBackedLocatorMixin.get_source_stamp = _source_stamp
-if numba.config.CACHE_DIR:
-    numba.config.CACHE_DIR = os.path.expanduser(numba.config.CACHE_DIR)
+numba.config.CACHE_DIR = os.path.expanduser(numba.config.CACHE_DIR)
 # Without a home, numba would make a folder called ~ in the current one.
 if not os.path.isabs(os.environ.get("XDG_CACHE_HOME", os.path.expanduser("~/.cache"))):
     caching.CompileResultCacheImpl._locator_classes.remove(caching.UserWideCacheLocator)

@@ -20,7 +20,6 @@ from bcrl.results.read import Finding, read_document, read_recorded
 from bcrl.run import locks
 
 INTERRUPTED, DAMAGED, WAITING = "interrupted", "damaged", "waiting"
-#: Where a seed may stand.
 STATES = (COMPLETE, RUNNING, INTERRUPTED, FAILED, DAMAGED, WAITING)
 
 

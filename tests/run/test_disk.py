@@ -82,9 +82,8 @@ def test_a_removed_folder_is_not_made_anew(tmp_path, monkeypatch, replaced):
 
     with monkeypatch.context() as patch:
         at_row(patch, 5, remove)
-        with pytest.raises(runner.SeedsFailed, match="removed or replaced") as failed:
+        with pytest.raises(runner.SeedsFailed, match="removed or replaced"):
             runner.run(p)
-    assert str(p.directory) in str(failed.value)
     assert p.directory.exists() == replaced
     left = [path.name for path in p.directory.glob("*")]
     assert left in ([], ["seed_0000.json"])  # no stray files

@@ -135,12 +135,6 @@ def test_files_and_exit_code_of_a_seed_that_failed(tmp_path, monkeypatch):
     assert np.isnan(list(found[-1].values())[3:]).all()  # missing: empty cells
 
 
-def numbers(seed, purpose, *path, episodes):
-    """What resets the episodes of a seed and a purpose."""
-    rngs = [stream(seed, purpose, *path)]
-    return tuple(starts_and_draws(rngs, Simulated(), episodes)[0].ravel().tolist())
-
-
 def fqi(env):
     for now, *rest in course(env, FOREST, (0, 1, 2), Boost()):
         yield now.count, now.stage.number, *rest
@@ -166,8 +160,9 @@ DOOMED = {
 @pytest.mark.parametrize("where", DOOMED)
 def test_a_simulator_that_fails_fails_its_seed(where):
     run, path, is_due = DOOMED[where]
-    doomed = numbers(BAD, *path, episodes=1)
-    some, well = run(replace(Simulated(), doomed=doomed)), run(Simulated())
+    starts, _ = starts_and_draws([stream(BAD, *path)], Simulated(), 1)
+    doomed = replace(Simulated(), doomed=tuple(starts.ravel().tolist()))
+    some, well = run(doomed), run(Simulated())
     for (*now, rows, failed), (*_, expected, _) in zip(some, well, strict=True):
         assert [rows[0], rows[2]] == [expected[0], expected[2]]
         assert set(failed) == ({1} if is_due(*now) else set())

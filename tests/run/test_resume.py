@@ -1,8 +1,7 @@
 """Runs that are interrupted, killed or raced end as if nothing had happened.
 
-The fast tests stop runs within this process. The slow ones send real signals and kill
-real processes; BCRL_KILLS=12 kills each of all variants so often (default: one each of
-a few).
+The slow tests send real signals and kill real processes; BCRL_KILLS=12 kills each of
+all variants so often (default: one each of a few).
 """
 
 import errno
@@ -205,7 +204,6 @@ def signals(*numbers: int):
 
 #: The number of workers, what happens once they train, and the possible exit codes.
 DISTURBED = {
-    "SIGTERM": (1, signals(signal.SIGTERM), [75]),
     "SIGHUP": (1, signals(signal.SIGHUP), [75]),
     "SIGUSR1": (2, signals(signal.SIGUSR1), [75]),
     "Ctrl-C": (2, lambda process, p: os.killpg(process.pid, signal.SIGINT), [75]),
