@@ -66,7 +66,7 @@ def _shown(asked: Namespace) -> bool:
 
 
 def _checked(asked: Namespace) -> list:
-    """The checked plans to run here; none after a flag's or Slurm's work."""
+    """The checked plans to run here; none if nothing is left to run."""
     from bcrl.config import jobs
     from bcrl.run import records, status
 

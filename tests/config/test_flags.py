@@ -168,7 +168,7 @@ def states(text: str) -> dict[str, list[int]]:
     """Row by row: seeds, complete, running, interrupted, failed, damaged, waiting."""
     head, *rows = text.splitlines()
     ends = [
-        re.search(rf"\b{word}\b", head).end() for word in ("seeds", *overview.STATES)
+        re.search(rf"\b{word}\b", head).end() for word in ("seeds", *records.STATES)
     ]
     found = {}
     for row in rows[: [x.startswith("in all") for x in rows].index(True)]:
