@@ -9,7 +9,6 @@ The objects are those of the `bcrl` command, without configs and files:
 
 from collections.abc import Callable, Iterable, Sequence
 from numbers import Integral
-from pathlib import Path
 
 import pandas as pd
 from tqdm import tqdm
@@ -33,7 +32,7 @@ from bcrl.learning.transfer import Boost, PolicyReuse, ResidualPolicy, Shape, wa
 from bcrl.q.regressors.ours import ForestRegressor as Forest
 from bcrl.q.regressors.ours import Tabular
 from bcrl.q.regressors.scikit import Sklearn
-from bcrl.results.read import read_folder
+from bcrl.results.read import read_folder as read
 from bcrl.run.workers import cores
 
 __all__ = ["CarOnHill", "Gymnasium", "LinearSystem", "Maze", "read", "run", "stages"]
@@ -57,8 +56,6 @@ def stages(
     BC-, `Shape()` SC-, both SBC-. Raises ConfigError for invalid combinations.
     """
     tasks = list(tasks)
-    if not tasks:
-        raise ConfigError("tasks", "0 tasks", "at least one is needed, the target last")
     boosts = [t for t in transfers if isinstance(t, Boost)]
     others = [t for t in transfers if not isinstance(t, Boost) and t is not warm_start]
     _check(tasks, transfers, max(len(boosts), len(others)))
@@ -81,12 +78,13 @@ def stages(
 
 def _check(tasks: Sequence[Env], transfers: Sequence[Transfer], most: int) -> None:
     """Raise ConfigError for arguments that no config could have."""
-    kinds = (("tasks", tasks, "n_actions", "an environment, such as Maze()"),)
-    kinds += (("transfers", transfers, "__call__", "a transfer, such as Boost()"),)
-    for key, values, needed, kind in kinds:
+    if not tasks:
+        raise ConfigError("tasks", "0 tasks", "at least one is needed, the target last")
+    kinds = ("tasks", tasks, "n_actions"), ("transfers", transfers, "__call__")
+    for key, values, needed in kinds:
         for value in values:
             if isinstance(value, type) or not hasattr(value, needed):
-                raise ConfigError(key, value, f"must be {kind}")
+                raise ConfigError(key, value, "must be an object, as Maze() or Boost()")
     if most > 1 or (warm_start in transfers and len(transfers) > 1):
         why = "must be one Boost() and one other at most, or warm_start alone"
         raise ConfigError("transfers", list(transfers), why)
@@ -109,38 +107,25 @@ def run(
     other seeds. Raises BcrlError for seeds that diverge.
     """
     compiling.check()
-    seeds, metrics, target = _checked(seeds), tuple(metrics), stages[-1].env
+    if isinstance(seeds, Integral):
+        raise ConfigError("seeds", seeds, f"name them: range({seeds}) or [{seeds}]")
+    seeds, metrics, target = tuple(seeds), tuple(metrics), stages[-1].env
+    whole = all(isinstance(seed, Integral) and seed >= 0 for seed in seeds)
+    if not whole or not 0 < len(seeds) == len(set(seeds)):
+        raise ConfigError("seeds", seeds, "must be different whole numbers from 0 on")
     tasks = [*dict.fromkeys(s.env for s in stages if s.env != target), target]
     probe: fqi_metrics.Probe | StepProbe = StepProbe(seeds, tasks)
     if isinstance(stages[-1].learner, FQI):
         fqi_metrics.check_metrics(metrics, target)
         probe = fqi_metrics.Probe(seeds, tasks, metrics)
     batch = SeedBatch(seeds, probe.states, threads or cores())
-    rows = []
-    length = sum(stage.learner.length for stage in stages)
+    rows, length = [], sum(stage.learner.length for stage in stages)
     with tqdm(total=length, unit=probe.index, disable=not progress) as bar:
         for snapshot in learn(stages, batch):
-            measured, where = probe.measure(snapshot), probe.place(snapshot)
+            for seed, row in zip(seeds, probe.measure(snapshot), strict=True):
+                rows.append({"seed": seed} | probe.place(snapshot) | row)
             if lost := [f"seed {seeds[s]}: {why}" for s, why in probe.failed.items()]:
                 raise BcrlError(f"at {probe.index} {snapshot.count}: {', '.join(lost)}")
-            pairs = zip(seeds, measured, strict=True)
-            rows += [{"seed": seed} | where | metrics for seed, metrics in pairs]
             bar.set_description_str(f"task {snapshot.stage.task}", refresh=False)
             bar.update(snapshot.count - bar.n)
     return pd.DataFrame(rows)
-
-
-def _checked(seeds: Iterable[int]) -> tuple[int, ...]:
-    """The seeds; ConfigError unless they are different whole numbers."""
-    if isinstance(seeds, Integral):
-        raise ConfigError("seeds", seeds, f"name them: range({seeds}) or [{seeds}]")
-    found = tuple(seeds)
-    whole = all(isinstance(seed, Integral) for seed in found)
-    if not whole or not found or len(set(found)) < len(found) or min(found) < 0:
-        raise ConfigError("seeds", found, "must be different whole numbers from 0 on")
-    return found
-
-
-def read(folder: str | Path) -> pd.DataFrame:
-    """The seeds that `bcrl` has recorded in a run's folder, as `run` gives them."""
-    return read_folder(folder)

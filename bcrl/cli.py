@@ -3,12 +3,9 @@
 Slow imports are made where they are needed, so that Tab and --help don't wait.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from argparse import Namespace
-from typing import TYPE_CHECKING
 
 import hydra
 
@@ -20,9 +17,6 @@ from bcrl.config.describe import describe
 from bcrl.config.hydra_compose import CONF, CONFIG_NAME, register_plugins, searchpath
 from bcrl.errors import BcrlError
 
-if TYPE_CHECKING:
-    from bcrl.config.plan import Plan
-
 FULL_ERROR = "HYDRA_FULL_ERROR"
 
 
@@ -30,38 +24,26 @@ def main() -> None:
     """Console entry point; rejects bad input with one message before any work."""
     ready()
     try:
-        plans = _planned()
-        if plans:
-            from bcrl.run import runner
-
-            runner.run(*plans)
-    except BcrlError as error:
-        say(f"bcrl: {error}")
-        sys.exit(error.exit_code)
-    except (Interrupted, KeyboardInterrupt):
-        say("bcrl: interrupted; run the same command again to resume")
-        sys.exit(EXIT_CODE)
-
-
-def _planned() -> list[Plan]:
-    """The plans to run here; none if something is shown, or Slurm has run them.
-
-    Raises BcrlError for whatever goes wrong.
-    """
-    try:
         if not sys.argv[1:]:
             show(flags.short())
             sys.exit(2)
         asked = flags.arguments()
-        return [] if _shown(asked) else _checked(asked)
-    except BcrlError:
-        raise
+        if not _shown(asked) and (plans := _checked(asked)):
+            from bcrl.run import runner
+
+            runner.run(*plans)
+    except (Interrupted, KeyboardInterrupt):
+        say("bcrl: interrupted; run the same command again to resume")
+        sys.exit(EXIT_CODE)
+    except BcrlError as error:
+        say(f"bcrl: {error}")
+        sys.exit(error.exit_code)
     except Exception as error:
         if os.environ.get(FULL_ERROR) == "1":
             raise
-        words = " ".join(str(error).split()) or "no further words"
-        why = f"{type(error).__name__}: {words}; {FULL_ERROR}=1 shows where"
-        raise BcrlError(why) from error
+        why = " ".join(f"{type(error).__name__}: {error}".split())
+        say(f"bcrl: {why}; {FULL_ERROR}=1 shows where")
+        sys.exit(BcrlError.exit_code)
 
 
 def _shown(asked: Namespace) -> bool:
@@ -83,8 +65,8 @@ def _shown(asked: Namespace) -> bool:
     return True
 
 
-def _checked(asked: Namespace) -> list[Plan]:
-    """The checked plans to run here, after what flags ask for."""
+def _checked(asked: Namespace) -> list:
+    """The checked plans to run here; none if nothing is left to run."""
     from bcrl.config import jobs
     from bcrl.run import records, status
 
@@ -114,9 +96,7 @@ def _show_by_hydra(asked: Namespace) -> None:
     register_plugins()
     folders = searchpath(getattr(asked, "folders", ()))
     sys.argv[1:] = [*flags.for_hydra(asked), *asked.overrides, *folders]
-    shows = hydra.main(
-        version_base="1.3", config_path=str(CONF), config_name=CONFIG_NAME
-    )
+    shows = hydra.main(str(CONF), CONFIG_NAME, version_base="1.3")
     before = os.environ.get(FULL_ERROR, "0")
     os.environ[FULL_ERROR] = "1"  # so that Hydra raises its errors
     try:

@@ -38,15 +38,10 @@ def at_least(key: str, value: int | None, least: int) -> None:
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """`did you mean maze?`, with the known words listed as long as they are few."""
     known = sorted(known)
-    close = guess(word, known)
-    listed = f"known: {', '.join(known)}" if len(known) <= 12 or not close else ""
-    return f"{close} ({listed})" if close and listed else close or listed
-
-
-def guess(word: str, known: Iterable[str]) -> str:
-    """`did you mean maze?`, or nothing where no known word is like it."""
-    close = closest(word, known)
-    return f"did you mean {close}?" if close else ""
+    near, listed = closest(word, known), f"known: {', '.join(known)}"
+    if near is None:
+        return listed
+    return f"did you mean {near}?" + f" ({listed})" * (len(known) <= 12)
 
 
 def closest(word: str, known: Iterable[str], like: float = 0.5) -> str | None:

@@ -19,9 +19,7 @@ def _trusts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(plugins.VARIABLE, "")
 
 
-def arguments(
-    *overrides: str, multirun: bool = False, config_dir: str | None = None
-) -> Namespace:
+def arguments(*overrides: str, multirun=False, config_dir=None) -> Namespace:
     """What `bcrl *overrides` parses to."""
     words = {"overrides": list(overrides), "multirun": multirun}
     return Namespace(**words, config_dir=config_dir, config_name=None)
@@ -45,12 +43,8 @@ def bcrl(tmp_path: Path):
     def run(*arguments: str) -> subprocess.CompletedProcess:
         program = "import sys; sys.argv[0] = 'bcrl'; from bcrl.cli import main; main()"
         own = {"XDG_CONFIG_HOME": tmp_path / "-"}
-        return subprocess.run(
-            [sys.executable, "-c", program, *arguments],
-            cwd=tmp_path,
-            env=os.environ | own,
-            capture_output=True,
-            text=True,
-        )
+        command, kept = [sys.executable, "-c", program, *arguments], os.environ | own
+        pipes = {"capture_output": True, "text": True}
+        return subprocess.run(command, cwd=tmp_path, env=kept, **pipes)
 
     return run

@@ -14,17 +14,12 @@ from bcrl.run import status
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = [
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "bench/README.md")),
-    *sorted(DOCS.rglob("*.md")),
-]
+PAGES = [ROOT / x for x in ("README.md", "CONTRIBUTING.md", "bench/README.md")]
+PAGES += sorted(DOCS.rglob("*.md"))
 TEXT = {page: page.read_text("utf-8") for page in PAGES}
-#: Commands that compose many jobs, or try out simulators.
 SLOW = r"experiment=|env=gymnasium|env=mountain_car"
-CITATION = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
 #: Made when the site is built.
 GENERATED = DOCS / "reference" / "config.md"
-each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 
 def commands(page: Path) -> list[str]:
@@ -58,7 +53,7 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", t.lower()).replace(" ", "-") for t in titles}
 
 
-@each_page
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_and_named_files_exist(page):
     """Files such as `bcrl/learning/stage.py`, `tests/run/` or `examples/own_env.py`."""
     text = re.sub(r"```.*?```", "", TEXT[page], flags=re.S)
@@ -79,23 +74,6 @@ def test_pages_that_code_and_configs_name_exist():
                 assert (ROOT / name).exists(), (path, name)
 
 
-SHORT = {
-    **{"FQI": "fitted q-iteration", "DQN": "deep q-network", "LQ": "linear-quadratic"},
-    **{"LSPI": "least-squares policy iteration", "IQM": "interquartile mean"},
-    **{"PPR": "policy reuse", "RPL": "residual polic", "ϱ": "residual"},
-    "γ": "discount",
-}
-
-
-@each_page
-def test_short_forms_are_spelled_out_on_each_page(page):
-    words = " ".join(TEXT[page].split()).lower()
-    prose = re.sub(r"```.*?```|`[^`]*`", "", TEXT[page], flags=re.S)
-    for short, meaning in SHORT.items():
-        if re.search(rf"(?<!\w){short}(?!\w)", prose):
-            assert meaning in words, short
-
-
 def test_every_page_is_in_the_navigation():
     navigation = (ROOT / "mkdocs.yml").read_text("utf-8").partition("\nnav:")[2]
     listed = set(re.findall(r": ([\w/.-]+\.md)$", navigation, re.M))
@@ -111,19 +89,12 @@ def test_the_glossary_explains_the_symbols_and_short_forms():
         assert any(re.search(rf"(?<!\w){re.escape(term)}\b", x) for x in first), term
 
 
-def test_the_paper_is_what_is_cited():
-    paper, readme = CITATION["preferred-citation"], TEXT[ROOT / "README.md"]
-    assert CITATION["cff-version"] == "1.2.0" and CITATION.keys() >= {
-        "message",
-        "title",
-    }
-    assert (paper["type"], paper["year"]) == ("conference-paper", 2022)
-    assert all(author["family-names"] in readme for author in paper["authors"])
-
-
-def test_there_is_one_version():
+def test_there_is_one_version_and_the_papers_authors_are_named():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert bcrl.__version__ == project["version"] == str(CITATION["version"])
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert bcrl.__version__ == project["version"] == str(cited["version"])
+    for author in cited["preferred-citation"]["authors"]:
+        assert author["family-names"] in TEXT[ROOT / "README.md"]
     found = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.M)
     assert found == ["Unreleased", bcrl.__version__]
 

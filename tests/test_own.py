@@ -27,6 +27,7 @@ RESULTS = {
     "algorithm=patient": ("BC-PATIENT",),
     "logger=lines": ("BC-FQI",),
 }
+CASES = list(zip(COMMANDS, RESULTS.values(), strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -44,32 +45,18 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("command", "names"), list(zip(COMMANDS, RESULTS.values(), strict=True))
-)
+@pytest.mark.parametrize(("command", "names"), CASES)
 def test_it_runs_from_outside(folder, monkeypatch, command, names):
     monkeypatch.chdir(folder)
     workers = 2 if "regressor" in command else 1  # processes that import the code
+    runs = folder / "runs" / str(len(command))
     small = ["scale=smoke", "seeds.count=2", "progress=none", f"workers={workers}"]
-    small += ["seeds.lockstep=1", f"runs_dir=runs/{len(command)}"]
+    small += ["seeds.lockstep=1", f"runs_dir={runs}"]
     monkeypatch.setattr(sys, "argv", ["bcrl", *shlex.split(command), *small])
     cli.main()
-    runs = folder / "runs" / str(len(command))
     for name in names:
         (made,) = runs.glob(f"smoke/swing_up/{name}/seed_0001.csv")
     for log in runs.glob(".lines/smoke/swing_up/BC-FQI/seed_0001.jsonl"):
-        lines = [json.loads(line) for line in log.read_text().splitlines()]
-        assert [line["return"] for line in lines] == pd.read_csv(made)[
-            "return"
-        ].tolist()
+        lines = [json.loads(line)["return"] for line in log.read_text().splitlines()]
+        assert lines == pd.read_csv(made)["return"].tolist()
     assert (runs / ".lines").exists() == ("logger" in command)
-
-
-def test_a_config_alone_may_not_name_the_code(folder, monkeypatch, tmp_path, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
-    (tmp_path / "bcrl").symlink_to(folder / "conf")  # found, but not named
-    monkeypatch.setattr(sys, "argv", ["bcrl", "env=swing_up", "--dry-run"])
-    with pytest.raises(SystemExit, match="2"):
-        cli.main()
-    assert "env.name=mine.swing_up" in capsys.readouterr().err

@@ -2,8 +2,7 @@
 
 numba trusts its files: half a file stops every run until someone removes it. Here each
 function has one file per signature, with a seal at its end: a hash of the content and
-of the source and key it belongs to. A damaged file counts as absent. If no folder can
-be written, the code is compiled again.
+of the source and key it belongs to. A damaged file counts as absent.
 """
 
 import functools
@@ -19,7 +18,6 @@ from numba.core import caching
 from bcrl.errors import BcrlError
 
 _SEAL = hashlib.sha256().digest_size  # bytes at the end of a file
-_UNCACHED: list[str] = []  # files of functions whose code no folder can keep
 
 
 def kept(function: Any = None, **options: Any) -> Any:
@@ -29,7 +27,6 @@ def kept(function: Any = None, **options: Any) -> Any:
     try:
         return numba.njit(function, cache=True, **options)
     except RuntimeError:  # numba finds no folder that it can write
-        _UNCACHED.append(function.__code__.co_filename)
         return numba.njit(function, **options)
 
 
@@ -61,10 +58,9 @@ class Files(caching.IndexDataCacheFile):
 
 
 def _source_stamp(locator: Any) -> str:
-    """What outdates a function's code: a change of any module beside the function.
+    """What outdates a function's code: a change of any module beside the function's.
 
-    numba compares only the function's own module, but compiled code contains the
-    functions of other modules that it calls. Ours stand in the same package.
+    Compiled code contains the functions that it calls; ours stand in the same package.
     """
     paths = sorted(Path(locator._py_file).parent.glob("*.py"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
@@ -73,25 +69,12 @@ def _source_stamp(locator: Any) -> str:
 def check() -> None:
     """Raise BcrlError if numba may not compile: some loops need it."""
     if numba.config.DISABLE_JIT:
-        why = "bcrl's loops have to be compiled; unset it (env -u NUMBA_DISABLE_JIT)"
-        raise BcrlError(f"NUMBA_DISABLE_JIT={numba.config.DISABLE_JIT}: {why}")
-
-
-def why_uncached() -> str | None:
-    """Why compiled code is lost with the process and what to do; None if it is kept."""
-    if not _UNCACHED:
-        return None
-    return (
-        "compiled code isn't kept, so each start takes a minute longer: neither "
-        f"{os.path.dirname(_UNCACHED[-1])} nor your cache folder can be written; set "
-        "NUMBA_CACHE_DIR to a folder that can"
-    )
+        raise BcrlError("NUMBA_DISABLE_JIT=1: unset it, bcrl's loops must be compiled")
 
 
 caching.IndexDataCacheFile = Files
 caching._SourceFileBackedLocatorMixin.get_source_stamp = _source_stamp
-if numba.config.CACHE_DIR:
-    numba.config.CACHE_DIR = os.path.expanduser(numba.config.CACHE_DIR)
+numba.config.CACHE_DIR = os.path.expanduser(numba.config.CACHE_DIR)
 # Without a home, numba would make a folder called ~ in the current one.
 if not os.path.isabs(os.environ.get("XDG_CACHE_HOME", os.path.expanduser("~/.cache"))):
     caching.CompileResultCacheImpl._locator_classes.remove(caching.UserWideCacheLocator)

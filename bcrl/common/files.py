@@ -17,8 +17,7 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> Path:
     """Let `write` fill a hidden file beside `path`, then rename it to `path`.
 
     A reader sees the old file or the new one, never half of one, and once this returns
-    the new one survives a power cut. Raises BcrlError if the folder is gone or cannot
-    be written to.
+    the new one survives a power cut. Raises BcrlError if it can't be written.
     """
     hidden = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -28,9 +27,7 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> Path:
             os.fsync(handle.fileno())
         os.replace(hidden, path)
     except OSError as error:
-        why = f"{error.strerror or error}"
-        why += "" if path.parent.is_dir() else f"; the folder {path.parent} is gone"
-        raise BcrlError(f"cannot write {path}: {why}") from error
+        raise BcrlError(f"cannot write {path}: {error.strerror or error}") from error
     finally:
         with suppress(OSError):
             hidden.unlink()
@@ -53,10 +50,9 @@ def user_folder(variable: str, usual: str) -> Path | None:
 
     None where no home is known: `~` never names a folder.
     """
-    with suppress(RuntimeError):
-        chosen = Path(os.environ.get(variable, "")).expanduser()
-        folder = chosen if chosen.is_absolute() else Path.home() / usual
-        return folder if folder.is_absolute() else None
+    for place in (os.environ.get(variable, ""), f"~/{usual}"):
+        if os.path.isabs(folder := os.path.expanduser(place)):
+            return Path(folder)
     return None
 
 

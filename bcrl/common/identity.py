@@ -4,12 +4,9 @@ from typing import Any
 
 Plain = dict[str, Any]  # a resolved config: dicts, lists and scalars
 
-#: Top-level keys that don't belong to a config's identity: they change no number, but
-#: for another device's rounding.
-OUTPUT_KEYS = (
-    *("seeds", "workers", "threads", "device"),
-    *("runs_dir", "tag", "progress", "strict", "checkpoint_every", "logger"),
-)
+#: Top-level keys that change no number, but for another device's rounding.
+OUTPUT_KEYS = ("seeds", "workers", "threads", "device", "runs_dir", "tag", "progress")
+OUTPUT_KEYS += ("strict", "checkpoint_every", "logger")
 
 
 def identity(config: Plain) -> Plain:

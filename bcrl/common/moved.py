@@ -4,29 +4,13 @@ import importlib.util
 import sys
 from importlib.abc import Loader
 from importlib.machinery import ModuleSpec
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-_LEARNING = ("bellman", "curriculum", "policies", "replay", "rollout", "stage")
+_TABLE = Path(__file__).with_name("moved.txt").read_text("utf-8")
 #: Old name → new name; modules below a package move with it.
-MOVED = {f"bcrl.{name}": f"bcrl.learning.{name}" for name in (*_LEARNING, "transfer")}
-MOVED |= {
-    "bcrl.algorithms": "bcrl.config.algorithms",
-    "bcrl.data": "bcrl.learning.dataset",
-    "bcrl.drawing": "bcrl.envs.rendering",
-    "bcrl.gym": "bcrl.envs.gym_api",
-    "bcrl.learners": "bcrl.learning",
-    "bcrl.loggers": "bcrl.results.loggers",
-    "bcrl.oracle": "bcrl.evaluation.oracle",
-    "bcrl.pack": "bcrl.common.serialization",
-    "bcrl.probes": "bcrl.evaluation.metrics",
-    "bcrl.q.estimator": "bcrl.q.forest.estimator",
-    "bcrl.q.mlp": "bcrl.q.networks.mlp",
-    "bcrl.q.regression": "bcrl.q.regressors.base",
-    "bcrl.q.scikit": "bcrl.q.regressors.scikit",
-    "bcrl.report.verify": "bcrl.results.verify",
-    "bcrl.streams": "bcrl.common.seeding",
-}
+MOVED = dict(line.split() for line in _TABLE.splitlines())
 
 
 class _Moved(Loader):

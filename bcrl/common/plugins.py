@@ -19,11 +19,10 @@ from bcrl.errors import ConfigError
 
 VARIABLE = "BCRL_TRUST"  # of this process and the workers that it starts
 #: The keys whose values may name code.
-NAMING = (
-    *("env.name", "env.id", "env.observation", "env.tasks.observation"),
-    *("env.wrappers", "env.tasks.wrappers", "algorithm.name"),
-    *("algorithm.regressor.name", "curriculum.name", "transfer.name", "logger.name"),
-)
+NAMING = ("env.name", "env.id", "env.observation", "env.tasks.observation")
+NAMING += ("env.wrappers", "env.tasks.wrappers", "algorithm.name")
+NAMING += ("algorithm.regressor.name", "curriculum.name", "transfer.name")
+NAMING += ("logger.name",)
 
 
 def named_code(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -48,8 +47,7 @@ def trust(name: str) -> None:
     """Let configs name the package that `name` begins with, here and in workers."""
     package = re.split("[.:]", name)[0]
     if not is_trusted(package):
-        before = os.environ.get(VARIABLE, "")
-        os.environ[VARIABLE] = f"{before},{package}".lstrip(",")
+        os.environ[VARIABLE] = f"{os.environ.get(VARIABLE, '')},{package}".lstrip(",")
 
 
 def is_foreign(name: str, ours: Collection[str]) -> bool:
@@ -71,8 +69,9 @@ def module(key: str, name: str, where: str, known: Collection[str] = ()) -> Modu
     if not all(part.isidentifier() for part in where.split(".")):
         raise ConfigError(key, name, "isn't the name of a module")
     if where.partition(".")[0] not in known and not is_trusted(where):
-        why = "a config alone can't name code of yours; type it on the command line, "
-        why += "or pass the config's folder by --config-dir"
+        why = (
+            "a config alone can't name code: type it, or pass its folder (--config-dir)"
+        )
         raise ConfigError(key, name, why)
     try:
         return importlib.import_module(where)
@@ -86,13 +85,10 @@ def fingerprint(config: Mapping[str, Any]) -> str:
     packages = {re.split("[.:]", name)[0] for _, name in named_code(config)} - {"bcrl"}
     digest = hashlib.sha256()
     for package in sorted(packages):
-        spec = importlib.util.find_spec(package)
-        folders = (spec and spec.submodule_search_locations) or ()
-        found = [path for folder in folders for path in Path(folder).rglob("*.py")]
-        if spec and spec.origin and not folders:  # not "built-in"
-            found = [Path(spec.origin)]
-        for path in sorted(filter(Path.is_file, found)):
-            digest.update(path.read_bytes())
+        if spec := importlib.util.find_spec(package):
+            for place in spec.submodule_search_locations or [str(spec.origin)]:
+                for path in sorted([Path(place), *Path(place).rglob("*.py")]):
+                    digest.update(path.read_bytes() if path.is_file() else b"")
     return digest.hexdigest() if packages else ""
 
 

@@ -1,7 +1,6 @@
 """Our tasks as environments of Gymnasium, registered by strings: `bcrl/Maze-v0` etc.
 
-Importing bcrl must stay light, so this module does not import Gymnasium: it registers
-the tasks once Gymnasium is imported, before or after bcrl.
+Importing bcrl must stay light, so the tasks are registered once Gymnasium is imported.
 """
 
 import importlib.util

@@ -3,10 +3,8 @@
 import numpy as np
 
 #: Purposes are numbered for good: a new one is appended, none is renumbered.
-PURPOSES = (
-    *("data", "exploration", "replay", "weights", "trees", "evaluation"),
-    "shared_data",
-)
+PURPOSES = ("data", "exploration", "replay", "weights", "trees", "evaluation")
+PURPOSES += ("shared_data",)
 
 
 def stream(seed: int, purpose: str, *path: int) -> np.random.Generator:

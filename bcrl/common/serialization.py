@@ -7,7 +7,6 @@ these come back: reading a file runs none of its content.
 import dataclasses
 import json
 import math
-import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +21,6 @@ from bcrl.errors import BcrlError
 DERIVED = {"derived": True}
 _STORABLE: dict[str, type] = {}
 _PLAIN = (type(None), bool, int, float, str)
-_BROKEN = (ValueError, TypeError, LookupError, AttributeError, OSError, EOFError)
 
 
 def storable(cls: type) -> type:
@@ -76,7 +74,7 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         with np.load(path, allow_pickle=False) as stored:
             yield stored
-    except (*_BROKEN, MemoryError, zipfile.BadZipFile, NotImplementedError) as error:
+    except Exception as error:
         why = f"can't be read ({error}); remove it, then its seeds start anew"
         raise BcrlError(f"{path} {why}") from error
 
@@ -90,29 +88,27 @@ class _Packer:
 
     def pack(self, thing: Any) -> Any:
         thing = thing.item() if isinstance(thing, np.generic) else thing
-        if type(thing) in _PLAIN:
+        kind, name, parts = type(thing), type(thing).__name__, None
+        if kind in _PLAIN:
             return thing
         if id(thing) in self._seen:
             return ["same", self._seen[id(thing)]]
-        packed = self._parts(thing)
+        if kind is np.ndarray and not thing.dtype.hasobject:
+            name, parts = "array", self._array(thing)
+        elif name == "Tensor" and kind.__module__.startswith("torch"):
+            name, parts = "tensor", self._array(thing.detach().cpu().numpy())
+        elif kind in (list, tuple):
+            parts = [self.pack(part) for part in thing]
+        elif kind is dict:
+            parts = [[self.pack(k), self.pack(v)] for k, v in thing.items()]
+        elif _STORABLE.get(_name(kind)) is kind:
+            fields = {key: self.pack(getattr(thing, key)) for key in _fields(kind)}
+            name, parts = "object", [_name(kind), fields]
+        else:
+            raise TypeError(f"{_name(kind)} is not storable")
         self._seen[id(thing)] = len(self._kept)
         self._kept.append(thing)
-        return packed
-
-    def _parts(self, thing: Any) -> list:
-        kind, name = type(thing), type(thing).__name__
-        if kind is np.ndarray and not thing.dtype.hasobject:
-            return ["array", self._array(thing)]
-        if name == "Tensor" and kind.__module__.startswith("torch"):
-            return ["tensor", self._array(thing.detach().cpu().numpy())]
-        if kind in (list, tuple):
-            return [name, [self.pack(part) for part in thing]]
-        if kind is dict:
-            return [name, [[self.pack(k), self.pack(v)] for k, v in thing.items()]]
-        if _STORABLE.get(_name(kind)) is kind:
-            fields = {key: self.pack(getattr(thing, key)) for key in _fields(kind)}
-            return ["object", [_name(kind), fields]]
-        raise TypeError(f"{_name(kind)} is not storable")
+        return [name, parts]
 
     def _array(self, array: NDArray) -> list:
         fortran = array.flags.f_contiguous and not array.flags.c_contiguous
@@ -125,39 +121,33 @@ class _Packer:
 
 class _Unpacker:
     def __init__(self, data: NDArray, given: Sequence[Any], device: str) -> None:
-        self.data, self.device = data, device
-        self.made = list(given)
+        self.data, self.device, self.made = data, device, list(given)
 
     def unpack(self, packed: Any) -> Any:
         if isinstance(packed, _PLAIN):
             return packed
-        kind, what = packed
+        kind, parts = packed
         if kind == "same":
-            return self.made[what]
-        whole = self._whole(kind, what)
-        self.made.append(whole)
-        return whole
-
-    def _whole(self, kind: str, parts: list) -> Any:
-        if kind == "list":
-            return [self.unpack(part) for part in parts]
-        if kind == "tuple":
-            return tuple(self.unpack(part) for part in parts)
-        if kind == "dict":
-            return {self.unpack(k): self.unpack(v) for k, v in parts}
+            return self.made[parts]
+        whole: Any
         if kind == "array":
-            return self._array(*parts)
-        if kind == "tensor":
+            whole = self._array(*parts)
+        elif kind == "tensor":
             import torch  # FQI does not need it
 
-            return torch.from_numpy(self._array(*parts)).to(self.device)
-        if kind == "object":
-            name, fields = parts
-            if fields.keys() == set(_fields(_STORABLE[name])):
-                made = {key: self.unpack(value) for key, value in fields.items()}
-                return _STORABLE[name](**made)
-            raise ValueError(f"its {name} has other fields than this version's")
-        raise ValueError(f"its structure holds an unknown {kind}")
+            whole = torch.from_numpy(self._array(*parts)).to(self.device)
+        elif kind in ("list", "tuple"):
+            whole = [self.unpack(part) for part in parts]
+            whole = whole if kind == "list" else tuple(whole)
+        elif kind == "dict":
+            whole = {self.unpack(k): self.unpack(v) for k, v in parts}
+        elif kind == "object" and parts[1].keys() == set(_fields(_STORABLE[parts[0]])):
+            fields = {key: self.unpack(value) for key, value in parts[1].items()}
+            whole = _STORABLE[parts[0]](**fields)
+        else:
+            raise ValueError(f"this version knows no such {kind}")
+        self.made.append(whole)
+        return whole
 
     def _array(self, start: int, dtype: str, shape: list[int], order: Any) -> NDArray:
         kind = np.dtype(dtype)

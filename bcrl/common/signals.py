@@ -36,11 +36,11 @@ class Stop:
                 signal.signal(number, signal.SIG_DFL)
                 os.kill(os.getpid(), number)
             if not self.requested:
-                name = signal.Signals(number).name
-                # Not print: the signal may have come in the middle of one.
-                text = f"bcrl: {name}: saving; once more to quit at once\n"
+                text = (
+                    f"bcrl: {signal.Signals(number).name}: saving; once more to quit\n"
+                )
                 with suppress(*GONE):
-                    os.write(2, text.encode())
+                    os.write(2, text.encode())  # print may be interrupted itself
             came.add(number)
             self.requested = True
 

@@ -31,8 +31,7 @@ def ready() -> None:
     # numba can't be imported with another number, and our loops must be compiled.
     if not count("NUMBA_NUM_THREADS"):
         os.environ.pop("NUMBA_NUM_THREADS", None)
-    if os.environ.pop("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
-        say("bcrl: NUMBA_DISABLE_JIT is ignored: bcrl's loops must be compiled")
+    os.environ.pop("NUMBA_DISABLE_JIT", None)
 
 
 def count(variable: str) -> int | None:

@@ -21,7 +21,7 @@ from bcrl.config.hydra_compose import CONF, CONFIG_NAME, Paths, composed, read_o
 from bcrl.config.overrides import canonical, parse, product
 from bcrl.config.plan import Plan
 from bcrl.config.schema import VARIANT_GROUPS
-from bcrl.errors import BcrlError, ConfigError, guess
+from bcrl.errors import BcrlError, ConfigError, closest
 
 #: The options that follow the authors' code, and the tag of runs that choose them all.
 RELEASED = "released"
@@ -94,9 +94,9 @@ def _folders(arguments: Namespace) -> Paths:
     folders = [Path(folder).absolute() for folder in found]
     for folder in folders:
         if not folder.is_dir():
-            close = guess(folder.name, [path.name for path in folder.parent.glob("*/")])
+            near = closest(folder.name, [p.name for p in folder.parent.glob("*/")])
             text = f"--config-dir: there is no folder {folder}"
-            raise BcrlError(f"{text}; {close}" if close else text)
+            raise BcrlError(f"{text}; did you mean {near}?" if near else text)
     arguments.folders = tuple(map(str, folders))
     return arguments.folders
 

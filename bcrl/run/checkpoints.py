@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Sequence
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,13 @@ from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
 from bcrl.results.layout import CHECKPOINT
 from bcrl.run.origin import LIBRARIES
-from bcrl.run.records import is_complete
+from bcrl.run.records import pending
 
 _SCHEMA = 1  # raised when the content's meaning changes
-#: Our code, read at the start: a file may change on disk while the loaded code stays.
+#: Our code and the libraries that compute, as they are at the start: a file may change
+#: on disk while the loaded code stays.
 _OURS = [p.read_bytes() for p in sorted(Path(__file__).parents[1].rglob("*.py"))]
+_CODE = sha256(b"".join(_OURS) + repr([version(name) for name in LIBRARIES]).encode())
 
 
 def save_checkpoint(
@@ -55,7 +56,7 @@ def remove_done(plan: Plan) -> None:
     """Remove the checkpoints whose seeds are all complete."""
     for path, about in _stored(plan.directory).items():
         seeds = about.get("seeds", ())
-        if seeds and all(is_complete(plan.directory, seed) for seed in seeds):
+        if seeds and not pending(plan, seeds):
             path.unlink(missing_ok=True)
 
 
@@ -73,18 +74,6 @@ def _stored(directory: Path) -> dict[Path, dict[str, Any]]:
 
 def _about(plan: Plan) -> dict[str, Any]:
     """The facts that must be equal for a run to resume from a checkpoint."""
-    config = json.dumps(identity(plan.config), sort_keys=True)
-    return {
-        "schema": _SCHEMA,
-        "code": _code(),
-        "sources": plan.sources,
-        "config": sha256(config.encode()),
-        "device": plan.device,
-    }
-
-
-@cache
-def _code() -> str:
-    """A hash of this package's code and of the libraries that compute."""
-    versions = [version(name) for name in LIBRARIES]
-    return sha256(b"".join(_OURS) + repr(versions).encode())
+    config = sha256(json.dumps(identity(plan.config), sort_keys=True).encode())
+    about = {"schema": _SCHEMA, "code": _CODE, "sources": plan.sources}
+    return about | {"config": config, "device": plan.device}

@@ -2,13 +2,13 @@
 
 import json
 import os
-import resource
 import socket
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from resource import RUSAGE_SELF, getrusage
 from typing import Any
 
 import numpy as np
@@ -23,8 +23,7 @@ from bcrl.learning.rollout import success_of
 from bcrl.learning.stage import CurriculumRun, SeedBatch, Snapshot
 from bcrl.results import loggers
 from bcrl.results.layout import COMPLETE, RUNNING
-from bcrl.run import checkpoints, records
-from bcrl.run.locks import Lock, claimed
+from bcrl.run import checkpoints, locks, records
 from bcrl.run.progress import Tick
 from bcrl.run.schedule import Job
 
@@ -32,16 +31,15 @@ from bcrl.run.schedule import Job
 def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
     """Train those of a job's seeds that are free and write each one's files.
 
-    Returns the seeds that failed, and why. An error ends this job alone: its seeds have
-    failed. After a request to `stop` it leaves a checkpoint, from which the next call
-    resumes.
+    Returns the seeds that failed, and why: all of them after an error. After a request
+    to `stop` it leaves a checkpoint, from which the next call resumes.
     """
     plan, seeds = job.plan, job.seeds
     strict = "raise" if plan.config["strict"] else "warn"
     try:
         records.make_run_directory(plan)
         with (
-            claimed(plan.directory, job.seeds) as held,
+            locks.claimed(plan.directory, seeds) as held,
             np.errstate(divide=strict, over=strict, invalid=strict),
         ):
             begun = checkpoints.batches(plan)
@@ -52,9 +50,9 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
             if not seeds or others & set(seeds):
                 return {}
             try:
+                job = replace(job, seeds=seeds, resumes=resumes)
                 with loggers.opened(plan.config, plan.directory, seeds) as log:
-                    training = _Training(replace(job, seeds=seeds), held, log)
-                    failed = training.train(resumes, tick, stop)
+                    failed = _Training(job, held, log).train(tick, stop)
             except Exception as error:
                 for seed in records.pending(plan, seeds):
                     with suppress(BcrlError):  # the folder may be gone
@@ -72,35 +70,36 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
 
 
 def _reason(error: Exception) -> str:
-    if isinstance(error, MemoryError):
-        what = "try fewer workers or seeds.lockstep, or a smaller scale"
-        return " ".join(f"out of memory: {error} ({what})".split())
     known = isinstance(error, BcrlError)
     return str(error) if known else f"{type(error).__name__}: {error}"
 
 
 class _Training:
-    """The training of seeds whose locks are `held`."""
+    """The training of a job's seeds, whose locks are `held`."""
 
-    def __init__(self, job: Job, held: Mapping[int, Lock], log: loggers.Log) -> None:
+    def __init__(self, job: Job, held: dict[int, locks.Lock], log: loggers.Log) -> None:
         self.job, self.held, self.log = job, held, log
         self.plan, self.seeds = plan, seeds = job.plan, job.seeds
         self.probe: Probe | StepProbe = Probe(seeds, plan.tasks, plan.metrics)
         if plan.family == "DQN":
             self.probe = StepProbe(seeds, plan.tasks)
-        self.batch = SeedBatch(seeds, self.probe.states, job.threads, plan.device)
-        self.run = CurriculumRun(plan.stages, self.batch)
+        batch = SeedBatch(seeds, self.probe.states, job.threads, plan.device)
+        self.run = CurriculumRun(plan.stages, batch)
         self.rows: list[list[dict[str, Any]]] = [[] for _ in seeds]  # of the CSVs
         self.failed: dict[int, str] = {}  # by place in the batch
         self.interruptions = 0
         self._began = _clocks()  # minus what was spent before an interruption
+        self._path = checkpoints.checkpoint_path(plan, seeds)
+        if job.resumes:
+            stored = read_content(self._path, self.run.given, plan.device)
+            self.run = CurriculumRun(plan.stages, batch, stored["past"])
+            self.probe.kept, self.failed = stored["kept"], stored["failed"]
+            self.rows, self.interruptions = json.loads(stored["rows"]), stored["stops"]
+            self._began -= stored["spent"]
+            log(self.probe.index, self.rows)
 
-    def train(
-        self, resumes: bool, tick: Callable[[Tick], None], stop: Stop
-    ) -> dict[int, str]:
-        """Train, from the checkpoint if one exists; the seeds that failed, and why."""
-        if resumes:
-            self._resume()
+    def train(self, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
+        """Train to the end or until `stop`; the seeds that failed, and why."""
         host = {"host": socket.gethostname(), "pid": os.getpid()}
         new = records.pending(self.plan, self.seeds)
         for seed in new:
@@ -122,67 +121,44 @@ class _Training:
                 self._save()
                 saved = time.monotonic()
         failed = self._record(new)
-        checkpoints.checkpoint_path(self.plan, self.seeds).unlink(missing_ok=True)
+        self._path.unlink(missing_ok=True)
         return failed
 
     def measure(self, snapshot: Snapshot) -> None:
-        """Append a row per seed; the last row of a seed may show its failure."""
+        """Append a row per seed; a failed seed's last row shows the failure."""
         index, where = self.probe.index, self.probe.place(snapshot)
-        new = [
-            [] if place in self.failed else [where | metrics]
-            for place, metrics in enumerate(self.probe.measure(snapshot))
-        ]
+        new = [[where | metrics] for metrics in self.probe.measure(snapshot)]
+        for place in self.failed:
+            new[place] = []
         self.log(index, new)
         for rows, added in zip(self.rows, new, strict=True):
             rows += added
         for place, why in self.probe.failed.items():
             self.failed.setdefault(place, f"{why} at {index} {snapshot.count}")
 
-    def _resume(self) -> None:
-        """Continue from the batch's checkpoint."""
-        path = checkpoints.checkpoint_path(self.plan, self.seeds)
-        stored = read_content(path, self.run.given, self.plan.device)
-        self.run = CurriculumRun(self.plan.stages, self.batch, stored["past"])
-        self.probe.kept, self.failed = stored["kept"], stored["failed"]
-        self.rows, self.interruptions = json.loads(stored["rows"]), stored["stops"]
-        self._began -= stored["spent"]
-        self.log(self.probe.index, self.rows)
-
     def _save(self) -> None:
-        """Write the batch's checkpoint."""
-        content = {
-            "past": self.run.state,
-            "kept": self.probe.kept,
-            "failed": self.failed,
-            # Many small values: one text takes less time and space.
-            "rows": json.dumps(self.rows),
-            "stops": self.interruptions,
-            "spent": _clocks() - self._began,
-        }
+        rows = json.dumps(self.rows)  # faster and smaller as one text
+        content = {"past": self.run.state, "kept": self.probe.kept, "rows": rows}
+        content |= {"failed": self.failed, "stops": self.interruptions}
+        content |= {"spent": _clocks() - self._began}
         self._check_locks()
         checkpoints.save_checkpoint(self.plan, self.seeds, content, self.run.given)
 
     def _check_locks(self) -> None:
         """BcrlError if the folder, and with it the locks, was taken away."""
         if not all(lock.holds() for lock in self.held.values()):
-            text = "was removed or replaced while its seeds were being computed"
-            raise BcrlError(f"{self.plan.directory} {text}; run the command again")
+            raise BcrlError(f"{self.plan.directory} was removed or replaced; run again")
 
     def _record(self, new: Sequence[int]) -> dict[int, str]:
         """Write the files of the `new` seeds; those that diverged, and why."""
         plan, failed = self.plan, {}
         wall, cpu = map(float, _clocks() - self._began)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        facts = self.probe.facts() | {
-            "wall_seconds": wall,
-            "cpu_seconds": cpu / len(self.seeds),  # this seed's share
-            "interruptions": self.interruptions,
-            "lockstep": list(self.seeds),
-            "device": plan.device,
-            "success": str(success_of(plan.target)),
-            "peak_memory_mib": peak / 1024,
-            **self.job.origin,
-        }
+        share = cpu / len(self.seeds)  # this seed's
+        facts = self.probe.facts() | {"wall_seconds": wall, "cpu_seconds": share}
+        facts |= {"interruptions": self.interruptions, "lockstep": list(self.seeds)}
+        facts |= {"device": plan.device, "success": str(success_of(plan.target))}
+        facts |= {"peak_memory_mib": getrusage(RUSAGE_SELF).ru_maxrss / 1024}
+        facts |= self.job.origin
         for place, seed in enumerate(self.seeds):
             if seed not in new:
                 continue

@@ -1,8 +1,6 @@
-"""Slurm's jobs: the plans of a command as submitit's job arrays, which resume.
+"""Slurm's jobs: the incomplete seeds of plans as submitit's job arrays, which resume.
 
-The seeds of a plan are split into jobs and complete seeds are left out. A job writes
-checkpoints after a signal, and Slurm requeues it if it was preempted. The results are
-read from the seeds' files afterwards.
+A job writes checkpoints after a signal, and Slurm requeues it if it was preempted.
 """
 
 import os
@@ -48,8 +46,8 @@ class _SlurmJob(submitit.helpers.Checkpointable):
             say(f"bcrl: {error}")
             code = error.exit_code
         except Interrupted:
-            own = f"--jobs={os.environ['SLURM_JOB_ID']}"
-            now = _squeue(own, "--format=%T %r")[0] or ""
+            job = os.environ["SLURM_JOB_ID"]
+            now = _squeue(f"--jobs={job}", "--format=%T %r")[0] or ""
             # Neither after scancel nor where Slurm requeues the job by itself.
             if now.startswith("RUNNING") or now.endswith("TimeLimit"):
                 usual = f"SIG{submitit.JobEnvironment.USR_SIG}"
@@ -61,8 +59,7 @@ class _SlurmJob(submitit.helpers.Checkpointable):
 def launch(plans: Sequence[Plan]) -> None:
     """Submit what is not complete, wait until the last job ends, and check the seeds.
 
-    Raises SeedsFailed as `runner.run` does, Unattended if Slurm keeps jobs that this
-    command can't wait for, and Interrupted after a signal.
+    Raises errors as `runner.run`, and Unattended if jobs remain that can't be awaited.
     """
     commands = ("sbatch", "srun", "squeue")
     if missing := [name for name in commands if not shutil.which(name)]:
@@ -85,10 +82,9 @@ def launch(plans: Sequence[Plan]) -> None:
             except (RuntimeError, OSError) as error:
                 if stop.requested:  # Ctrl-C also ends a hanging sbatch
                     break
-                raise _rejected(error, arrays, first, len(jobs)) from error
+                raise _rejected(error, arrays, f"{first} of {len(jobs)}") from error
             arrays.append(made[0].job_id.partition("_")[0])
-            count = f"{len(some)} job{'s' * (len(some) > 1)}"
-            say(f"Slurm: {count} as {arrays[-1]}; logs in {folder}")
+            say(f"Slurm: {len(some)} jobs as {arrays[-1]}; logs in {folder}")
             if stop.requested:
                 break
         if arrays or stop.requested:
@@ -108,23 +104,21 @@ def _executor(params: dict[str, Any]) -> submitit.AutoExecutor:
     return executor
 
 
-def _rejected(error: Exception, arrays: Sequence[str], taken: int, n: int) -> BcrlError:
+def _rejected(error: Exception, arrays: Sequence[str], taken: str) -> BcrlError:
     """The error to raise if sbatch fails, perhaps after it took some arrays."""
     words = " ".join(str(error).split())
     if not arrays:
         return BcrlError(f"Slurm rejects the jobs, none was submitted: {words}")
     names = " ".join(arrays)
     return Unattended(
-        f"Slurm took {taken} of {n} jobs, as {names}, and rejects the rest: {words}\n"
-        f"`scancel {names}` ends them; once they are over, run the same command again "
-        "to submit the incomplete rest"
+        f"Slurm took {taken} jobs, as {names}, and rejects the rest: {words}\n"
+        f"`scancel {names}` ends them; then run the same command again for the rest"
     )
 
 
 def _wait(arrays: Sequence[str], telling: bool, stop: Stop) -> None:
     """Wait until no array has a job waiting or running; a signal interrupts."""
     pause, before, answered = 1.0, "", time.monotonic()
-    names = " ".join(arrays)
     while not stop.requested:
         listed, why = _squeue("--me", "--array", "--format=%F %T")
         now = f"squeue fails, trying again: {why}"
@@ -136,27 +130,23 @@ def _wait(arrays: Sequence[str], telling: bool, stop: Stop) -> None:
                 return
             now = ", ".join(f"{n} {s.lower()}" for s, n in sorted(states.items()))
         elif time.monotonic() > answered + _PATIENCE:
-            text = f"squeue has failed for {_PATIENCE / 60:.0f} minutes: {why}"
-            more = f"the jobs of {names} may still run (--status shows it)"
-            raise Unattended(f"{text}; {more}")
+            raise Unattended(f"{' '.join(arrays)} may still run; squeue fails: {why}")
         if now != before and (telling or why):
             say(f"Slurm: {now}")
-        pause = 1.0 if now != before else min(30.0, 1.2 * pause)
-        before = now
+        pause, before = 1.0 if now != before else min(30.0, 1.2 * pause), now
         time.sleep(pause)
     if arrays:
-        say(f"bcrl: Slurm continues with the jobs; `scancel {names}` ends them")
+        say(f"bcrl: Slurm continues; `scancel {' '.join(arrays)}` ends the jobs")
     raise Interrupted
 
 
 def _squeue(*options: str) -> tuple[str | None, str]:
     """Slurm's queue, or None and why squeue fails, as while Slurm restarts."""
-    command = ["squeue", "--noheader", *options]
+    words = ["squeue", "--noheader", *options]
     try:
-        done = subprocess.run(command, capture_output=True, timeout=60)
+        done = subprocess.run(words, capture_output=True, timeout=60, errors="replace")
     except (OSError, subprocess.TimeoutExpired) as error:
         return None, str(error)
-    said = (done.stderr if done.returncode else done.stdout).decode(errors="replace")
     if done.returncode:
-        return None, " ".join(said.split()) or f"exit code {done.returncode}"
-    return said.strip(), ""
+        return None, f"exit code {done.returncode}, {done.stderr.strip()}"
+    return done.stdout.strip(), ""

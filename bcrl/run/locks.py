@@ -1,7 +1,6 @@
 """Locks on seeds: one process computes a seed, on one machine or a shared file system.
 
 The kernel holds them (flock, through filelock), so a process that dies loses its locks.
-A lock file's text names the holder, for people to read.
 """
 
 import errno
@@ -31,8 +30,7 @@ class Lock:
     def acquire(self, seconds: float = 0.0) -> bool:
         """Take the lock within `seconds`; False if another process keeps it.
 
-        The half-written files of a process that died are removed. Raises BcrlError
-        where files can't be made or locked.
+        Half-written files of a dead process are removed. BcrlError if locking fails.
         """
         try:
             self._lock.acquire(timeout=seconds)
@@ -41,8 +39,7 @@ class Lock:
         except OSError as error:
             why = f"cannot write or lock {self.path}: {error.strerror}"
             if error.errno in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
-                why += "; mount the file system with locks (Lustre: -o flock) or name "
-                why += "another folder"
+                why += "; mount it with locks (Lustre: -o flock) or name another folder"
             raise BcrlError(f"runs_dir: {why}") from error
         with suppress(OSError):
             self.path.write_text(f"process {os.getpid()} on {socket.gethostname()}")
@@ -70,19 +67,14 @@ class Lock:
     def holder(self) -> str:
         """The process that holds the lock, by its own words."""
         with suppress(OSError):
-            return self.path.read_text("utf-8", "replace") or "another process"
+            return self.path.read_text("utf-8", "replace")
         return "another process"
-
-
-def seed_lock(folder: Path, seed: int) -> Lock:
-    """The lock of a seed's files."""
-    return Lock(folder, seed_name(seed))
 
 
 def is_held(folder: Path, seed: int) -> bool:
     """Whether a process is computing this seed; the check writes nothing."""
     try:
-        with open(seed_lock(folder, seed).path, "rb") as file:
+        with open(Lock(folder, seed_name(seed)).path, "rb") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError as error:
         return isinstance(error, BlockingIOError)
@@ -95,8 +87,7 @@ def claimed(folder: Path, seeds: Sequence[int]) -> Iterator[dict[int, Lock]]:
     with ExitStack() as stack:
         held = {}
         for seed in seeds:
-            lock = seed_lock(folder, seed)
-            if lock.acquire():
+            if (lock := Lock(folder, seed_name(seed))).acquire():
                 held[seed] = lock
                 stack.callback(lock.release)
         yield held
@@ -105,6 +96,5 @@ def claimed(folder: Path, seeds: Sequence[int]) -> Iterator[dict[int, Lock]]:
 def tidy(folder: Path) -> None:
     """Remove lock files and half-written files of processes that died."""
     for path in folder.glob(".*.lock"):
-        lock = Lock(folder, path.name.removeprefix(".").removesuffix(".lock"))
-        if lock.acquire():
+        if (lock := Lock(folder, path.stem.removeprefix("."))).acquire():
             lock.release()

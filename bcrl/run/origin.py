@@ -20,23 +20,18 @@ def run_origin() -> dict[str, Any]:
     """The command, versions, git revision and machine."""
     program, *words = sys.argv
     versions = {"bcrl": __version__, "python": platform.python_version()}
+    versions |= {name: version(name) for name in LIBRARIES}
     cpus = Path("/proc/cpuinfo")  # of Linux
     text = cpus.read_text("utf-8", "replace") if os.access(cpus, os.R_OK) else ""
-    processor = re.search(r"model name\s*: (.*)", text)
+    cpu = re.findall(r"model name\s*: (.*)", text) or [platform.processor()]
     # An installed package may lie in the checkout of another project.
     ours = _git("ls-files", "--error-unmatch", "__init__.py")
+    dirty, system = bool(ours and _git("status", "--porcelain")), platform.platform()
     return {
         "command": shlex.join([Path(program).name, *words]),
-        "versions": versions | {name: version(name) for name in LIBRARIES},
-        "git": {
-            "revision": ours and _git("rev-parse", "HEAD"),
-            "dirty": bool(ours and _git("status", "--porcelain")),
-        },
-        "machine": {
-            "system": platform.platform(),
-            "processor": processor[1] if processor else platform.processor(),
-            "cores": os.cpu_count(),
-        },
+        "versions": versions,
+        "git": {"revision": ours and _git("rev-parse", "HEAD"), "dirty": dirty},
+        "machine": {"system": system, "processor": cpu[0], "cores": os.cpu_count()},
     }
 
 

@@ -32,19 +32,14 @@ class Progress:
     """Shows the ticks of jobs that `workers` take in order; `mode`: see config.yaml."""
 
     def __init__(self, jobs: Sequence[Job], workers: int, mode: str) -> None:
-        if mode == "auto":
-            mode = "bar" if getattr(sys.stderr, "isatty", bool)() else "lines"
         self.jobs, self.workers, self.mode, self.bar = jobs, workers, mode, None
         self.expected = np.array([job.seconds for job in jobs])
         self.share, self.spent = np.zeros((2, len(jobs)))  # of each job, done
         self.began = time.monotonic()
         self._shown = (0.0, self.began)  # share of the work and time, when shown last
-        if mode == "bar":
+        if mode == "bar" or (mode == "auto" and getattr(sys.stderr, "isatty", bool)()):
             shape = "{desc} |{bar}| {percentage:3.0f}% {elapsed}{postfix}"
-            try:
-                self.bar = tqdm(total=1.0, bar_format=shape)
-            except (ValueError, TypeError):  # a TQDM_* variable that tqdm can't read
-                self.mode = "lines"
+            self.bar = tqdm(total=1.0, bar_format=shape)
 
     def tick(self, number: int, tick: Tick) -> None:
         """Note how far the job of this number is, and show it if that is due."""
@@ -60,8 +55,8 @@ class Progress:
             return
         self._shown = done, now
         unit = "step" if plan.family == "DQN" else "iteration"
-        where = f"{plan.env} {plan.name} · T{tick.task} · {unit} {tick.count}/"
-        where += f"{plan.length} · {named(seeds)}"
+        where = f"{plan.env} {plan.name} · T{tick.task}"
+        where += f" · {unit} {tick.count}/{plan.length} · {named(seeds)}"
         left = f"{tqdm.format_interval(self.to_go())} to go"
         if self.bar is None:
             line = f"{where} · {done:4.0%} · {tqdm.format_interval(now - self.began)}"
@@ -80,6 +75,6 @@ class Progress:
 
     def close(self) -> None:
         """Leave the terminal tidy."""
-        if self.bar is not None:
-            with suppress(*GONE):
+        with suppress(*GONE):
+            if self.bar is not None:
                 self.bar.close()

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from bcrl.common import files
 from bcrl.common.divergence import diverging
@@ -20,9 +19,7 @@ from bcrl.results.layout import COMPLETE, CONFIG, FAILED, RUNNING, seed_path
 from bcrl.results.read import Finding, read_document, read_recorded
 from bcrl.run import locks
 
-_MALFORMED = (ValueError, LookupError, TypeError, AttributeError, yaml.YAMLError)
 INTERRUPTED, DAMAGED, WAITING = "interrupted", "damaged", "waiting"
-#: Where a seed may stand.
 STATES = (COMPLETE, RUNNING, INTERRUPTED, FAILED, DAMAGED, WAITING)
 
 
@@ -30,22 +27,21 @@ def check_directory(plan: Plan) -> None:
     """Raise BcrlError if the folder can't be written or has another config's runs."""
     directory = plan.directory
     existing = next(p for p in (directory, *directory.absolute().parents) if p.exists())
-    if not existing.is_dir():
-        raise BcrlError(f"runs_dir: {existing} is a file; name another folder")
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise BcrlError(f"runs_dir: no permission to write in {existing}")
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        why = "is no folder, or there is no permission to write in it"
+        raise BcrlError(f"runs_dir: {existing} {why}; name another")
     present = directory / CONFIG
     try:
         changed = differences(yaml.safe_load(present.read_bytes()), plan.config)
     except FileNotFoundError:
         return
-    except (OSError, *_MALFORMED) as error:
+    except Exception as error:  # whatever the file holds
         raise BcrlError(f"{present} can't be read ({error}); move it away") from error
     if changed:
         lines = [f"  {k}: there {a!r}, here {b!r}" for k, (a, b) in changed.items()]
-        lines.insert(0, f"{directory} holds runs of a different config:")
-        lines.append("choose another tag (tag=NAME) or runs_dir, or remove the folder")
-        raise BcrlError("\n".join(lines))
+        todo = "choose another tag (tag=NAME) or runs_dir, or remove the folder"
+        why = f"{directory} holds runs of a different config:"
+        raise BcrlError("\n".join([why, *lines, todo]))
 
 
 def make_run_directory(plan: Plan) -> None:
@@ -58,8 +54,8 @@ def make_run_directory(plan: Plan) -> None:
     try:
         check_directory(plan)
         if not (directory / CONFIG).exists():
-            kept = identity(plan.config)
-            text = yaml.safe_dump(kept, sort_keys=False, allow_unicode=True)
+            options = {"sort_keys": False, "allow_unicode": True}
+            text = yaml.safe_dump(identity(plan.config), **options)
             files.write_text(directory / CONFIG, text)
     finally:
         lock.release()
@@ -85,25 +81,15 @@ def state(directory: Path, seed: int) -> tuple[str, str]:
     return INTERRUPTED if noted == RUNNING else noted, why
 
 
-def states(directory: Path, seeds: Sequence[int]) -> dict[int, tuple[str, str]]:
-    """The `state` of each seed."""
-    return {seed: state(directory, seed) for seed in seeds}
-
-
 def problems(name: str, found: Mapping[int, tuple[str, str]]) -> list[str]:
-    """Lines about failed and damaged seeds, given the `states` of a variant's seeds."""
+    """Lines about failed and damaged seeds, given the `state` of each seed."""
     return by_reason(name, {s: f"{x}: {why}" for s, (x, why) in found.items() if why})
-
-
-def is_complete(directory: Path, seed: int) -> bool:
-    """Whether a seed is complete and its files are unchanged."""
-    return state(directory, seed)[0] == COMPLETE
 
 
 def pending(plan: Plan, seeds: Iterable[int] | None = None) -> list[int]:
     """The plan's seeds, or those of `seeds`, that are not complete yet."""
     asked = plan.seeds if seeds is None else seeds
-    return [seed for seed in asked if not is_complete(plan.directory, seed)]
+    return [seed for seed in asked if state(plan.directory, seed)[0] != COMPLETE]
 
 
 def read_facts(directory: Path, seed: int) -> Plain:
@@ -122,20 +108,14 @@ def write_status(plan: Plan, seed: int, status: str, facts: Plain) -> None:
 
 
 def write_seed(
-    plan: Plan,
-    seed: int,
-    status: str,
-    rows: Sequence[Mapping[str, int | float]],
-    arrays: Mapping[str, NDArray],
-    facts: Plain,
+    plan: Plan, seed: int, status: str, rows: list[Plain], arrays: Plain, facts: Plain
 ) -> None:
     """Write a seed's CSV, NPZ and, last, its JSON with the hashes of both."""
     lines = [",".join(rows[0])]
     # A value that is missing (NaN) is an empty cell, as in the report's tables.
     lines += [",".join(repr(x) if x == x else "" for x in row.values()) for row in rows]
-    text, packed = "\n".join(lines) + "\n", io.BytesIO()
-    np.savez(packed, **dict(arrays))
-    data = packed.getvalue()
+    np.savez(packed := io.BytesIO(), **arrays)
+    data, text = packed.getvalue(), "\n".join([*lines, ""])
     npz, csv = (seed_path(plan.directory, seed, suffix) for suffix in ("npz", "csv"))
     files.write_atomically(npz, lambda file: file.write(data))
     files.write_text(csv, text)

@@ -3,15 +3,13 @@
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
-from bcrl.common import compiling
 from bcrl.common.signals import Interrupted, Stop
 from bcrl.common.terminal import say
 from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
 from bcrl.evaluation import oracle
-from bcrl.results.layout import COMPLETE
+from bcrl.results.layout import COMPLETE, seed_name
 from bcrl.run import checkpoints, costs, job, locks, records, status
 from bcrl.run.origin import run_origin
 from bcrl.run.progress import Progress
@@ -34,8 +32,6 @@ def run(*plans: Plan) -> None:
     """
     quiet = plans[0].config["progress"] == "none"
     plans, stop, failed = tuple(merged(plans)), Stop(), Failures()
-    if not quiet and (why := compiling.why_uncached()):
-        say(why)
     with stop.on_signals():
         for plan in plans:
             _prepare(plan, quiet)
@@ -55,29 +51,24 @@ def run(*plans: Plan) -> None:
 def check_complete(plans: Sequence[Plan]) -> None:
     """Raise SeedsFailed, as `run`, for seeds that other processes left incomplete."""
     plans, failed = merged(plans), Failures()
-    usual = {
-        records.WAITING: "never begun",
-        records.INTERRUPTED: "begun, but its process died or was stopped",
-    }
     for plan in plans:
-        for seed, (state, why) in records.states(plan.directory, plan.seeds).items():
-            if state != COMPLETE:
-                failed.setdefault(plan.directory, {})[seed] = why or usual[state]
+        found = {seed: records.state(plan.directory, seed) for seed in plan.seeds}
+        lost = {s: why or x for s, (x, why) in found.items() if x != COMPLETE}
+        failed[plan.directory] = lost
     _check(plans, failed)
 
 
 def _check(plans: Sequence[Plan], failed: Failures) -> None:
     """Raise SeedsFailed if seeds failed, with the commands that run them again."""
-    if not (number := sum(map(len, failed.values()))):
-        return
-    lines = [f"{number} seed{'s' * (number > 1)} failed, all others are complete:"]
-    lost = [plan for plan in plans if plan.directory in failed]
-    for plan in lost:
-        reasons = dict(sorted(failed[plan.directory].items()))
+    number, lines, commands = sum(map(len, failed.values())), list[str](), list[str]()
+    for plan in plans:
+        reasons = dict(sorted(failed.get(plan.directory, {}).items()))
         lines += records.by_reason(f"  {plan.env} {plan.name}", reasons)
-    lines.append(f"to run just {'these' if number > 1 else 'this'} again:")
-    lines += [f"  {line}" for plan in lost for line in plan.command.splitlines()]
-    raise SeedsFailed("\n".join(lines))
+        commands += [f"  {line}" for line in plan.command.splitlines() if reasons]
+    if number:
+        first = f"{number} seed{'s' * (number > 1)} failed, all others are complete:"
+        text = [first, *lines, "to run just this again:", *commands]
+        raise SeedsFailed("\n".join(text))
 
 
 def _prepare(plan: Plan, quiet: bool) -> None:
@@ -85,7 +76,8 @@ def _prepare(plan: Plan, quiet: bool) -> None:
     records.check_directory(plan)
     locks.tidy(plan.directory)
     checkpoints.remove_done(plan)
-    name, states = f"{plan.env} {plan.name}", records.states(plan.directory, plan.seeds)
+    name = f"{plan.env} {plan.name}"
+    states = {seed: records.state(plan.directory, seed) for seed in plan.seeds}
     if note := costs.memory_note(plan):
         say(f"{name}: {note}")
     for line in records.problems(f"bcrl: {name}", states):
@@ -107,14 +99,7 @@ def _train(jobs: Sequence[Job], failed: Failures, stop: Stop) -> None:
     origin = run_origin()  # of the code that starts: its files may change meanwhile
     jobs = [replace(each, threads=threads, origin=origin) for each in jobs]
     shown = Progress(jobs, workers, options["progress"])
-    if workers > 1:
-        outcomes = do_jobs(job.train, jobs, workers, shown.tick, stop)
-    else:
-        outcomes = (
-            (number, job.train(each, partial(shown.tick, number), stop))
-            for number, each in enumerate(jobs)
-            if not stop.requested
-        )
+    outcomes = do_jobs(job.train, jobs, workers, shown.tick, stop)
     try:
         for number, lost in outcomes:
             plan = jobs[number].plan
@@ -136,8 +121,7 @@ def _is_free(work: Job) -> bool:
 def _wait(jobs: Sequence[Job], quiet: bool, stop: Stop) -> None:
     """Wait until one of the jobs that other processes do is free."""
     if not quiet:
-        lock = locks.seed_lock(jobs[0].plan.directory, jobs[0].seeds[0])
-        held = f"{lock.name} in {lock.folder} is computed by {lock.holder()}"
-        say(f"waiting: {held}" + f", and {len(jobs) - 1} more jobs" * (len(jobs) > 1))
+        lock = locks.Lock(jobs[0].plan.directory, seed_name(jobs[0].seeds[0]))
+        say(f"waiting for {len(jobs)} jobs: {lock.path} is held by {lock.holder()}")
     while not (stop.requested or any(map(_is_free, jobs))):
         time.sleep(0.2)

@@ -36,13 +36,11 @@ def merged(plans: Sequence[Plan]) -> list[Plan]:
     together: dict[Path, Plan] = {}
     for plan in plans:
         before = together.get(plan.directory, plan)
-        commands = dict.fromkeys([*before.command.splitlines(), plan.command])
-        together[plan.directory] = replace(
-            before,
-            asked=tuple(dict.fromkeys(before.asked + plan.asked)),
-            seeds=tuple(dict.fromkeys(before.seeds + plan.seeds)),
-            command="\n".join(commands),
-        )
+        asked = tuple(dict.fromkeys(before.asked + plan.asked))
+        seeds = tuple(dict.fromkeys(before.seeds + plan.seeds))
+        command = "\n".join(dict.fromkeys([*before.command.splitlines(), plan.command]))
+        both = replace(before, asked=asked, seeds=seeds, command=command)
+        together[plan.directory] = both
     return list(together.values())
 
 
@@ -73,6 +71,5 @@ def ordered(plans: Sequence[Plan], failed: Failures) -> list[Job]:
     for plan, seeds in new:
         least = -(-len(seeds) // plan.lockstep)  # batches of at most `lockstep` seeds
         number = min(-(-least // spread) * spread, len(seeds))  # even for the workers
-        parts = np.array_split(seeds, number)
-        jobs += [Job(plan, tuple(part.tolist())) for part in parts]
+        jobs += [Job(plan, tuple(p.tolist())) for p in np.array_split(seeds, number)]
     return sorted(jobs, key=lambda job: -job.seconds)

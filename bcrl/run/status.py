@@ -11,9 +11,7 @@ from bcrl.config import jobs
 from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
 from bcrl.results import layout
-from bcrl.results.layout import RUNNING
 from bcrl.run import costs, locks, records
-from bcrl.run.records import STATES
 from bcrl.run.schedule import Failures, merged, ordered
 
 
@@ -54,16 +52,16 @@ def status(arguments: Namespace) -> str:
             raise BcrlError(f"runs_dir={plan.root}: holds no runs")
     else:
         asked += [(p.directory, p.seeds) for p in merged(jobs.plans(arguments))]
-    rows: dict[str, list[int]] = {}
-    lines: list[str] = []
+    rows, lines = dict[str, list[int]](), list[str]()
     for directory, seeds in asked:
-        name, found = " ".join(directory.parts[-3:]), records.states(directory, seeds)
+        name = " ".join(directory.parts[-3:])
+        found = {seed: records.state(directory, seed) for seed in seeds}
         lines += records.problems(name, found)
-        found |= {s: (RUNNING, "") for s in seeds if locks.is_held(directory, s)}
+        found |= {s: (layout.RUNNING, "") for s in seeds if locks.is_held(directory, s)}
         states = [state for state, _ in found.values()]
-        rows[name] = [len(seeds), *map(states.count, STATES)]
+        rows[name] = [len(seeds), *map(states.count, records.STATES)]
     rows["in all"] = [sum(column) for column in zip(*rows.values(), strict=True)]
-    return "\n".join([_table(rows, "seeds", *STATES), *lines])
+    return "\n".join([_table(rows, "seeds", *records.STATES), *lines])
 
 
 def diverging_lines(plan: Plan) -> list[str]:

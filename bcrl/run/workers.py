@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from multiprocessing import connection, resource_tracker
 from typing import Any
 
@@ -18,18 +19,19 @@ Do = Callable[[Any, Callable[[Any], None], Any], Any]
 
 
 def do_jobs(
-    do: Do,
-    jobs: Sequence[Any],
-    workers: int,
-    report: Callable[[int, Any], None],
-    stop: Stop,
+    do: Do, jobs: Sequence, workers: int, report: Callable[[int, Any], None], stop: Stop
 ) -> Iterator[tuple[int, Any]]:
     """The jobs' numbers and results as they come, done in order by `workers` processes.
 
-    `report` takes a job's number and its reports. If a process dies, its job's result
-    is a text that says so. After a request to stop, running jobs stop, too, and no
-    other begins.
+    One worker is this process. `report` takes a job's number and its reports. If a
+    process dies, its job's result is a text that says so. After a request to stop,
+    running jobs stop, too, and no other begins.
     """
+    if workers == 1:
+        for number, job in enumerate(jobs):
+            if not stop.requested:
+                yield number, do(job, partial(report, number), stop)
+        return
     pool = dict(_started(do) for _ in range(min(workers, len(jobs))))
     waiting, stopped = list(range(len(jobs))), False
     doing: dict[Any, int] = {}  # the number of a job, by its process's pipe
@@ -89,9 +91,8 @@ def _send(pipe: Any, message: Any) -> None:
 
 def cores() -> int:
     """Cores that this process may use; not every Slurm binds a job to its own."""
-    there = os.cpu_count() or 1
-    if hasattr(os, "sched_getaffinity"):
-        there = len(os.sched_getaffinity(0))
+    affinity = getattr(os, "sched_getaffinity", None)
+    there = len(affinity(0)) if affinity else os.cpu_count() or 1
     return min(there, count("SLURM_CPUS_PER_TASK") or there)
 
 

@@ -33,11 +33,8 @@ def there_and_back(tmp_path):
 
 
 def test_values_come_back_with_their_types(there_and_back):
-    content = {
-        "text": "ϱ",
-        3: (None, True, 2**70, -0.0, float("inf"), [1.5, 1e-300, float("nan")]),
-        "nothing": {},
-    }
+    numbers = (None, True, 2**70, -0.0, float("inf"), [1.5, 1e-300, float("nan")])
+    content = {"text": "ϱ", 3: numbers, "nothing": {}}
     assert repr(there_and_back(content)) == repr(content)
     numbers = there_and_back([np.float64(0.1), np.int64(7), np.bool_(True)])
     assert repr(numbers) == "[0.1, 7, True]"
@@ -98,9 +95,7 @@ FORGED = [
     ["array", [0, "<f8", [1000], "C"]],
     ["array", [-8, "<f8", [1], "C"]],
     ["same", 5],
-    ["given", 3],
     ["call", "os.system"],
-    {"py/object": "os.system"},
 ]
 
 

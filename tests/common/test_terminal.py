@@ -68,4 +68,3 @@ def test_large_values_diverge():
     far = {"q_mean": np.array([np.nan, -900.0]), "discounted_return": np.array([-4, 2])}
     assert diverging(far) == {"q_mean": 900.0}
     assert diverging(far | {"discounted_return": np.array([-90.0, 2.0])}) == {}
-    assert diverging({"q_error": np.array([np.inf, np.nan])}) == {}

@@ -168,7 +168,7 @@ def states(text: str) -> dict[str, list[int]]:
     """Row by row: seeds, complete, running, interrupted, failed, damaged, waiting."""
     head, *rows = text.splitlines()
     ends = [
-        re.search(rf"\b{word}\b", head).end() for word in ("seeds", *overview.STATES)
+        re.search(rf"\b{word}\b", head).end() for word in ("seeds", *records.STATES)
     ]
     found = {}
     for row in rows[: [x.startswith("in all") for x in rows].index(True)]:
@@ -183,7 +183,7 @@ def test_the_overview_tells_states_apart_by_locks_and_files(tmp_path):
     p = plan(*options, "seeds.count=6")
     for seed, status in ((2, "running"), (3, "running"), (4, "failed: key=1: no")):
         records.write_status(p, seed, status, {})
-    computing = locks.seed_lock(p.directory, 2)
+    computing = locks.Lock(p.directory, "seed_0002")
     assert computing.acquire()
     before = everything(tmp_path)
     for asked in (
@@ -207,7 +207,7 @@ def test_debug_is_small_strict_alone_and_apart(tmp_path, monkeypatch):
     assert p.root.parent == Path("runs/.debug") and p.config["workers"] == 1
     assert p.seeds == (0,) and p.name.startswith("BC-FQI")
     runner.run(p)
-    assert records.is_complete(p.directory, 0)
+    assert 0 not in records.pending(p)
 
 
 @pytest.mark.parametrize("strict", [True, False])

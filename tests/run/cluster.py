@@ -1,7 +1,6 @@
 """A Slurm of one node on this machine: slurmctld, slurmd and munged in a folder.
 
-The daemons are children that die with their parent, on free ports, so that nothing is
-left behind and nothing that is left can be in the way.
+The daemons are children that die with their parent, on free ports.
 """
 
 import contextlib
@@ -22,10 +21,7 @@ CONF = Path(__file__).with_name("slurm.conf").read_text()
 
 @contextlib.contextmanager
 def running(seconds: float = 30.0) -> Iterator[dict[str, str]]:
-    """The environment in which Slurm's commands reach a cluster that is ready.
-
-    RuntimeError, with the daemons' logs, if it isn't within `seconds`.
-    """
+    """The environment in which Slurm's commands reach a cluster that is ready."""
     # Not below a private folder: munge's socket has to be within everyone's reach.
     folder = Path(tempfile.mkdtemp(prefix="slurm_"))
     folder.chmod(0o711)
@@ -76,7 +72,5 @@ def _output(command: list[str], environment: dict) -> str:
 
 
 def _free_ports() -> list[int]:
-    with socket.socket() as one, socket.socket() as other:
-        for each in (one, other):
-            each.bind(("127.0.0.1", 0))
-        return [each.getsockname()[1] for each in (one, other)]
+    with socket.create_server(("", 0)) as one, socket.create_server(("", 0)) as other:
+        return [one.getsockname()[1], other.getsockname()[1]]

@@ -1,8 +1,7 @@
 """Runs that are interrupted, killed or raced end as if nothing had happened.
 
-The fast tests stop runs within this process. The slow ones send real signals and kill
-real processes; BCRL_KILLS=12 kills each of all variants so often (default: one each of
-a few).
+The slow tests send real signals and kill real processes; BCRL_KILLS=12 kills each of
+all variants so often (default: one each of a few).
 """
 
 import errno
@@ -13,6 +12,7 @@ import pickle
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -51,28 +51,25 @@ class Countdown(Stop):
         return self.left <= 0
 
 
-@pytest.mark.parametrize(
-    ("kind", "steps"), [("maze BC", 5), ("dqn C", 330), ("dqn SBC", 180)]
-)
-def test_a_run_that_stops_again_and_again_ends_in_equal_files(
-    tmp_path, monkeypatch, kind, steps
-):
+#: A kind of run, and after how many checks it stops.
+STOPS = [("maze BC", 5), ("dqn C", 330), ("dqn SBC", 180)]
+
+
+@pytest.mark.parametrize(("kind", "steps"), STOPS)
+def test_a_run_that_stops_often_ends_in_equal_files(tmp_path, monkeypatch, kind, steps):
     calm = run(tmp_path / "calm", *KINDS[kind])
     p = plan(*KINDS[kind], f"runs_dir={tmp_path}/here", "checkpoint_every=1e9")
     monkeypatch.setattr(runner, "Stop", Countdown)
     monkeypatch.setattr(Countdown, "left", steps)
     stops = 0
     while pending(p):
-        try:
+        with suppress(Interrupted):
             runner.run(p)
-        except Interrupted:
-            stops += 1
-            check_left(p)
+            break
+        stops += 1
+        check_left(p)
     assert stops >= 3 and about(p, 0)["interruptions"] == stops
     assert compared(calm, p) is None
-
-
-# --- what a checkpoint may be ---
 
 
 def interrupted(folder: Path, *choice: str):
@@ -134,11 +131,8 @@ def test_other_seeds_than_a_checkpoints_start_by_themselves(tmp_path):
     assert not path.exists() and pending(p) == []
 
 
-# --- locks ---
-
-
 def test_a_seed_has_one_holder_who_is_named_and_whose_death_frees_it(tmp_path):
-    lock, other = (locks.seed_lock(tmp_path, 7) for _ in range(2))
+    lock, other = (locks.Lock(tmp_path, "seed_0007") for _ in range(2))
     assert lock.acquire() and not other.acquire() and locks.is_held(tmp_path, 7)
     assert str(os.getpid()) in other.holder()
     lock.release()
@@ -147,7 +141,7 @@ def test_a_seed_has_one_holder_who_is_named_and_whose_death_frees_it(tmp_path):
     for name in (
         "seed_0007.lock",
         "seed_0007.csv.1.tmp",
-        "checkpoint_0007_ab.npz.1.tmp",
+        "checkpoint_0007_a.npz.1.tmp",
     ):
         (tmp_path / f".{name}").touch()
     assert not locks.is_held(tmp_path, 7)
@@ -162,10 +156,7 @@ def test_a_file_system_without_locks_is_rejected(tmp_path, monkeypatch, code):
 
     monkeypatch.setattr(locks.fcntl, "flock", flock)
     with pytest.raises(BcrlError, match=f"runs_dir: .*{tmp_path}.*words of the system"):
-        locks.seed_lock(tmp_path, 7).acquire()
-
-
-# --- real processes ---
+        locks.Lock(tmp_path, "seed_0007").acquire()
 
 
 def kill(folder: Path, name: str) -> dict:
@@ -213,7 +204,6 @@ def signals(*numbers: int):
 
 #: The number of workers, what happens once they train, and the possible exit codes.
 DISTURBED = {
-    "SIGTERM": (1, signals(signal.SIGTERM), [75]),
     "SIGHUP": (1, signals(signal.SIGHUP), [75]),
     "SIGUSR1": (2, signals(signal.SIGUSR1), [75]),
     "Ctrl-C": (2, lambda process, p: os.killpg(process.pid, signal.SIGINT), [75]),
@@ -231,12 +221,8 @@ def test_a_disturbed_command_saves_resumes_and_ends_in_equal_files(tmp_path, cal
     workers, disturb, codes = DISTURBED[how]
     p = plan(*LONG, f"runs_dir={tmp_path}")
     words = [*LONG, f"runs_dir={tmp_path}", f"workers={workers}", "progress=lines"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, *words],
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    kept = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    process = subprocess.Popen([sys.executable, "-c", PROGRAM, *words], **kept)
     process.stderr.readline()  # it trains
     disturb(process, p)
     text = process.communicate(timeout=180)[1] or ""

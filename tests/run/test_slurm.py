@@ -4,6 +4,7 @@ Without Slurm the tests on a real one are skipped; with BCRL_SLURM=1 they fail.
 """
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -28,8 +29,6 @@ PROGRAM = "import sys; from bcrl.cli import main; sys.argv[0] = 'bcrl'; main()"
 LIMIT = 120.0  # seconds in which anything waited for must happen
 
 
-# --- made-up commands instead of Slurm ---
-
 REJECTS = {
     "sbatch": "echo >> calls; [ $(wc -l < calls) -le {taken} ] && "
     "{{ echo Submitted batch job 4711; exit; }}; echo QOSMaxSubmit >&2; exit 1",
@@ -40,19 +39,17 @@ THREE = "-m env=maze variant=BC scale=smoke seeds.count=3 hydra/launcher=slurm"
 THREE += " hydra.launcher.seeds_per_job=1 progress=none"
 
 
-@pytest.mark.parametrize(
-    ("taken", "code", "words"),
-    [
-        (None, 2, ["hydra/launcher=slurm: there is no sbatch"]),
-        (0, 2, ["none was submitted", "QOSMaxSubmit"]),
-        (1, 3, ["scancel 4711", "QOSMaxSubmit"]),
-        (2, 3, ["slurm_load_jobs error", "4711"]),
-    ],
-)
-def test_a_slurm_that_rejects_jobs_ends_the_command(
-    tmp_path, monkeypatch, capsys, taken, code, words
-):
-    """Three jobs are two arrays here, of which sbatch takes so many."""
+#: How many of two arrays sbatch takes → the exit code, and parts of the message.
+REJECTED = {
+    None: (2, "hydra/launcher=slurm: there is no sbatch"),
+    0: (2, "none was submitted.*QOSMaxSubmit"),
+    1: (3, "QOSMaxSubmit.*scancel 4711"),
+    2: (3, "4711 may still run.*slurm_load_jobs error"),
+}
+
+
+@pytest.mark.parametrize("taken", REJECTED)
+def test_jobs_that_slurm_rejects_end_the_command(tmp_path, monkeypatch, taken, capsys):
     there = {} if taken is None else REJECTS
     for name, text in there.items():
         (tmp_path / name).write_text(f"#!/bin/bash\n{text.format(taken=taken)}\n")
@@ -64,11 +61,9 @@ def test_a_slurm_that_rejects_jobs_ends_the_command(
     monkeypatch.setattr(sys, "argv", ["bcrl", *THREE.split()])
     with pytest.raises(SystemExit) as ended:
         cli.main()
-    text = capsys.readouterr().err
-    assert ended.value.code == code and all(word in text for word in words), text
-
-
-# --- a real Slurm ---
+    code, words = REJECTED[taken]
+    assert ended.value.code == code
+    assert re.search(words, capsys.readouterr().err, re.S)
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +146,7 @@ def test_a_sweep_whose_jobs_are_disturbed_ends_in_equal_files(slurm, tmp_path):
 
     code, text = sweep.end()
     assert code == 1 and "1 seed failed" in text, text
-    assert "begun, but its process died" in text and "Traceback" not in text
+    assert ": interrupted" in text and "Traceback" not in text
     assert [sweep.restarts(job) for job in (warned, failed, killed)] == [1, 1, 0]
     for job in (warned, failed):
         facts = sweep.about(job)
@@ -164,7 +159,7 @@ def test_a_sweep_whose_jobs_are_disturbed_ends_in_equal_files(slurm, tmp_path):
     calm = plans(*SWEEP, f"runs_dir={tmp_path / 'calm'}", multirun=True)
     runner.run(*calm)
     code, text = again.end()
-    assert code == 0 and text.startswith("Slurm: 1 job "), text
+    assert code == 0 and text.startswith("Slurm: 1 jobs "), text
     assert {compared(*pair) for pair in zip(calm, again.plans, strict=True)} == {None}
 
 
