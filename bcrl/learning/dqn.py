@@ -6,7 +6,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from bcrl.common.seeding import stream
 from bcrl.common.serialization import storable
@@ -96,7 +95,7 @@ class DQNState:
     loss: Floats  # (S,) summed over the updates since the last snapshot
     updates: int = 0  # since the last snapshot
     step: int = 0  # steps done in this stage
-    residual: NDArray | None = None  # (S, A) ϱ at `env_state`, if computed
+    residual: Any = None  # (S, A) ϱ at `env_state`, if computed
 
 
 @dataclass(eq=False)
@@ -114,7 +113,7 @@ class DQNTrainer:
         self.state = now = self.state or self._initial_state()
         updater = one_by_one if now.replay.rows.is_cpu else batched
         self._gradient_step = updater(now.deep, now.replay)
-        self._frozen = self._frozen_at(now.env_state)
+        self._frozen = self._frozen_at(now.env_state)  # before the present step
         if isinstance(self.start.behavior, ResidualPolicy):
             self._combined = combined_actions(self.env.actions)
         self._block = -1  # the block whose uniforms are drawn
@@ -123,9 +122,9 @@ class DQNTrainer:
         """The state before the first step; new networks unless warm-started."""
         env, settings, number = self.env, self.settings, self.stage.number
         seeds, device, n = self.batch.seeds, self.batch.device, len(self.batch.seeds)
-        rngs = [stream(seed, "exploration", number) for seed in seeds]
-        lanes = lanes_of(env)
+        rngs = (stream(seed, "exploration", number) for seed in seeds)
         noise = np.stack([rng.random(env.initial_noise) for rng in rngs])
+        lanes = lanes_of(env)
         env_state = lanes.begin(env.initial(noise))
         if isinstance(self.start.initial, DeepQ):
             deep = self.start.initial.clone()
@@ -163,11 +162,9 @@ class DQNTrainer:
             v, next_v = potential.max(-1), next_potential.max(-1)
             zero = start.shape.zero_at_goal
             reward = reward + shaping(v, next_v, absorbing, env.gamma, zero)
-        base_sa, gamma = base[np.arange(len(own)), own], env.gamma
-        target = precompute_target(
-            reward, absorbing, next_base, base_sa, gamma, start.boost
-        )
-        now.replay.add(now.env_state, next_state, *target, own)
+        now_base = base[np.arange(len(own)), own]
+        known = (reward, absorbing, next_base, now_base, env.gamma, start.boost)
+        now.replay.add(now.env_state, next_state, *precompute_target(*known), own)
         now.steps_in_episode += 1
         over = absorbing | cut | (now.steps_in_episode == env.horizon)
         if over.any():
@@ -182,16 +179,17 @@ class DQNTrainer:
         block, at = divmod(self.state.step, DRAW_BLOCK)
         if block != self._block:
             width = CHOICES + self.env.step_noise + self.env.initial_noise
-            self._uniforms = self._drawn("exploration", block, width)
-            picks = self._drawn("replay", block, self.settings.batch_size)
+            widths = {"exploration": width, "replay": self.settings.batch_size}
+            path, seeds = (self.stage.number, block), self.batch.seeds
+            self._uniforms, picks = (  # (DRAW_BLOCK, S, width)
+                np.stack(
+                    [stream(s, of, *path).random((DRAW_BLOCK, n)) for s in seeds], 1
+                )
+                for of, n in widths.items()
+            )
             self._indices = self.state.replay.indices(picks, at)
             self._block = block
         return self._uniforms[at]
-
-    def _drawn(self, purpose: str, block: int, width: int) -> Floats:
-        """A block's uniforms (DRAW_BLOCK, S, width)."""
-        rngs = (stream(s, purpose, self.stage.number, block) for s in self.batch.seeds)
-        return np.stack([rng.random((DRAW_BLOCK, width)) for rng in rngs], 1)
 
     def _values(self, q: Any, state: Floats) -> Floats:
         """Values (S, A) of a Q-function at one state (S, d) of each seed."""
@@ -228,7 +226,7 @@ class DQNTrainer:
         return own, self._combined[advised, own]
 
     def update(self) -> None:
-        """One gradient step per seed, each on a separate batch."""
+        """One gradient step for each seed, on a batch of its own."""
         now, target_update = self.state, self.settings.target_update
         at, since = now.step % DRAW_BLOCK, now.deep.steps % target_update
         # After a copy of the target (or a new block) the batches until the next one.
@@ -270,7 +268,7 @@ class DQNTrainer:
         failed |= now.lanes.failures  # one lane per seed
         return StepSnapshot(self.stage, count, now, result, *measured, failed=failed)
 
-    def _evaluated_policy(self, states: Any, u: NDArray, alive: NDArray) -> NDArray:
+    def _evaluated_policy(self, states: Any, u: Floats, alive: Any) -> Integers:
         """A `Policy`: half of the lanes explore, the other half is greedy.
 
         Greedy lanes do not reuse the prior (PPR).
@@ -278,8 +276,6 @@ class DQNTrainer:
         start, settings = self.start, self.settings
         exploring = np.repeat([True, False], settings.evaluation_episodes)
         epsilon = np.where(exploring, settings.evaluation_epsilon, 0.0)
-        base = start.base(states, self.n_actions)  # (S, E, A)
-        same = start.prior is start.base
-        prior = base if same else start.prior(states, self.n_actions)
-        residual = self.state.deep(states, self.n_actions)
+        parts = (self.state.deep, start.base, start.prior)
+        residual, base, prior = (q(states, self.n_actions) for q in parts)  # (S, E, A)
         return self._choose(residual, (base, None, prior), u, epsilon, exploring)[1]

@@ -100,19 +100,20 @@ class FQI:
                 y = residual_target(
                     reward[s], d.absorbing, q[d.next_state], base_sa, env.gamma
                 )
-                for a, part in enumerate(d.by_action):
+                for a, (rows, others) in enumerate(d.by_action):
                     path = () if self.fixed_trees else (stage.number, k, a)
-                    rows = (part.x, y[part.rows], part.multiplicity, part.queries)
-                    if len(part.rows):  # an action that was never tried has no model
-                        problems[s, a] = Problem(*rows, batch.seeds[s], path)
+                    x, counts = d.points[d.state[rows]], d.multiplicity[rows]
+                    fitted = (x, y[rows], counts, d.points[others])
+                    if len(rows):  # an action that was never tried has no model
+                        problems[s, a] = Problem(*fitted, batch.seeds[s], path)
             keep = not is_finite(env)  # a table is not queried between its points
             fits, lost = fit_each(self.regressor, problems, keep, batch.threads)
             failed = lost | failed
             residual = [values.copy() for values in residual]
             for (s, a), fit in fits.items():
-                part = data[s].by_action[a]
-                residual[s][data[s].state[part.rows], a] = fit.fitted
-                residual[s][part.query_points, a] = fit.queried
+                rows, others = data[s].by_action[a]
+                residual[s][data[s].state[rows], a] = fit.fitted
+                residual[s][others, a] = fit.queried
                 models[s][a] = Fitted.of(problems[s, a], fit)
             total = [b + r for b, r in zip(base, residual, strict=True)]
             if start.shape is not None:

@@ -1,7 +1,7 @@
 """Transfers: how the result of one stage enters the next.
 
-A transfer edits the next stage's `StageInit`. Several can be combined: `Boost` and
-`Shape` make SBC-DQN. Learners read only the `StageInit`.
+A transfer edits the next stage's `StageInit`, which is all that learners read. Several
+can be combined: `Boost` and `Shape` make SBC-DQN.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ def plain_search(env, state, action, depth):
 @MASSES
 def test_boxes_enclose_where_their_cells_go(mass):
     cells, n = oracle.CELLS, 200_000
-    low, high = oracle.image_boxes(mass, cells)
+    low, high = oracle.image_boxes(mass)
     rng = np.random.default_rng(5)
     cell = rng.integers(0, cells, (n, 2))
     cell[: n // 2, 0] = rng.integers(cells // 3, 2 * cells // 3, n // 2)  # near p = 0

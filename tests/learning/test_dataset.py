@@ -42,8 +42,7 @@ def test_the_dataset_is_the_episodes_with_repetitions_counted(env):
     if env.finite:
         assert len(d.state) <= 10 < len(expected)  # the corridor repeats itself
     assert np.array_equal(d.points[d.probe], probe)
-    for a, part in enumerate(d.by_action):
-        assert (d.action[part.rows] == a).all()
-        asked = set(part.x.ravel().tolist()) | set(part.queries.ravel().tolist())
-        assert asked == set(d.points.ravel().tolist())
-        assert not set(part.x.ravel().tolist()) & set(part.queries.ravel().tolist())
+    for a, (own, others) in enumerate(d.by_action):
+        assert own.tolist() == np.flatnonzero(d.action == a).tolist()
+        asked = [*set(d.state[own].tolist()), *others.tolist()]
+        assert sorted(asked) == list(range(len(d.points)))

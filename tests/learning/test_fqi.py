@@ -66,16 +66,13 @@ def test_tabulated_and_general_evaluation_agree_with_the_same_forests(transfers)
 
 
 def test_an_action_never_tried_keeps_its_approximator():
-    tasks, batch = (
-        [Corridor(), Corridor(prize=5.0)],
-        SeedBatch((0,), Corridor().states()),
-    )
+    tasks, probe = [Corridor(), Corridor(prize=5.0)], Corridor().states()
+    batch = SeedBatch((0,), probe)
     first, second = stages(tasks, iterations=3, new_data=(True, False))
     *_, before = learn_stages([first], batch)
     (data,) = before.result.data
-    left, right = data.by_action
-    starved = replace(left, rows=np.empty(0, np.intp))
-    data = [replace(data, by_action=(starved, right))]
+    (_, left), right = data.by_action
+    data = [replace(data, by_action=[(np.empty(0, np.intp), left), right])]
     start = begin([warm_start], replace(before.result, data=data))
     *_, after = second.learner.learn(second, start, batch)
     assert np.array_equal(after.probed_q[0][:, 0], before.probed_q[0][:, 0])
