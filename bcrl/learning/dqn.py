@@ -67,8 +67,7 @@ class DQN:
     ) -> Iterator[Pause]:
         """Learn a stage; yields before the first step and after each.
 
-        Snapshots come before the first step that is not random, after every
-        `evaluate_every` steps and after the last.
+        Snapshots come before the first step that is not random, and then regularly.
         """
         run = DQNTrainer(self, stage, start, batch, state)
         if state is None:
@@ -98,23 +97,24 @@ class DQNState:
     residual: Any = None  # (S, A) ϱ at `env_state`, if computed
 
 
-@dataclass(eq=False)
 class DQNTrainer:
     """S seeds in the middle of a stage, each with its environment and networks."""
 
-    settings: DQN
-    stage: Stage
-    start: StageInit
-    batch: SeedBatch
-    state: Any = None  # the `DQNState` of a pause, or a new one
-
-    def __post_init__(self) -> None:
-        self.env, self.n_actions = self.stage.env, self.stage.env.n_actions
-        self.state = now = self.state or self._initial_state()
+    def __init__(
+        self,
+        of: DQN,
+        stage: Stage,
+        start: StageInit,
+        batch: SeedBatch,
+        state: Any = None,
+    ) -> None:
+        self.settings, self.stage, self.start, self.batch = of, stage, start, batch
+        self.env, self.n_actions = stage.env, stage.env.n_actions
+        self.state = now = state or self._initial_state()
         updater = one_by_one if now.replay.rows.is_cpu else batched
         self._gradient_step = updater(now.deep, now.replay)
         self._frozen = self._frozen_at(now.env_state)  # before the present step
-        if isinstance(self.start.behavior, ResidualPolicy):
+        if isinstance(start.behavior, ResidualPolicy):
             self._combined = combined_actions(self.env.actions)
         self._block = -1  # the block whose uniforms are drawn
 
@@ -220,9 +220,8 @@ class DQNTrainer:
         if not isinstance(behavior, ResidualPolicy):
             return own, own
         advised = greedy(prior, u[..., 2])
-        copying = now.n_greedy_decisions < behavior.offset  # (S,)
-        copying = copying.reshape(-1, *[1] * (own.ndim - 1))
-        own = np.where(copying & (u[..., 0] >= epsilon), advised, own)
+        copying = (now.n_greedy_decisions < behavior.offset) & (u[..., 0] >= epsilon).T
+        own = np.where(copying.T, advised, own)
         return own, self._combined[advised, own]
 
     def update(self) -> None:
@@ -259,13 +258,14 @@ class DQNTrainer:
         weights = torch.isfinite(now.deep.online.flat).all(1).cpu().numpy()
         failed: dict[int, str] = {}
         for part, finite in (("loss", np.isfinite(now.loss)), ("weights", weights)):
-            lost = np.flatnonzero(~finite).tolist()
-            failed |= dict.fromkeys(lost, f"non-finite {part}")
+            failed |= dict.fromkeys(
+                np.flatnonzero(~finite).tolist(), f"non-finite {part}"
+            )
         loss = now.loss / now.updates if now.updates else now.loss + np.nan
         now.loss, now.updates = np.zeros_like(loss), 0
         result = StageResult(self.start.total(now.deep), now.deep)
         measured = (self._evaluated_policy, self.settings.evaluation_episodes, loss)
-        failed |= now.lanes.failures  # one lane per seed
+        failed |= now.lanes.failures  # each seed has one lane
         return StepSnapshot(self.stage, count, now, result, *measured, failed=failed)
 
     def _evaluated_policy(self, states: Any, u: Floats, alive: Any) -> Integers:

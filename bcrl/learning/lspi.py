@@ -37,9 +37,7 @@ class LSPI:
 
     Each iteration collects its share of the `steps` in whole episodes with the current
     gain, solves LSTDQ on these alone and sets K ← −Quu⁻¹ Qus. `features`: see
-    `bcrl.q.quadratic`. `drop_last` leaves each episode's last step out [released]. A
-    seed fails if its gain is not finite, or if a force grows with its position, away
-    from the goal.
+    `bcrl.q.quadratic`. `drop_last` leaves each episode's last step out [released].
     """
 
     iterations: int = 4
@@ -79,9 +77,8 @@ class LSPI:
             q = Quadratic.from_weights(theta, self.features, d + k, env.actions)
             better = [improved(matrix, env) for matrix in q.matrix]
             gain = np.stack([np.zeros((k, d)) if x is None else x for x in better])
-            lost = [s for s, x in enumerate(better) if x is None]
             why = f"LSPI found no stabilising gain in iteration {i}"
-            failed = dict.fromkeys(lost, why) | state.failed
+            failed = {s: why for s, x in enumerate(better) if x is None} | state.failed
             state = LSPIState(i, gain, q, failed)
             yield self._snapshot(stage, state)
 
@@ -99,11 +96,8 @@ class LSPI:
         env, (seeds, k, d) = stage.env, gain.shape
         rngs = [stream(x, "data", stage.number, iteration) for x in batch.seeds]
         start, u = starts_and_draws(rngs, env, self.episodes_per_iteration(env), k)
-        played, n = (
-            play(env, partial(_act, gain, self.noise_std), start, u),
-            env.horizon,
-        )
-        n -= self.drop_last
+        played = play(env, partial(_act, gain, self.noise_std), start, u)
+        n = env.horizon - self.drop_last
         state = played.state[:, :, :n].reshape(seeds, -1, d)
         next_state = played.state[:, :, 1 : n + 1].reshape(seeds, -1, d)
         action = played.action[:, :, :n].reshape(seeds, -1, k)

@@ -42,9 +42,8 @@ class Replay:
         """A replay without transitions."""
         shape = (n_seeds, capacity)
         rows = torch.zeros((*shape, 2 * d + n_actions + 3), device=device)
-        return cls(
-            rows, np.zeros(shape, np.float32), np.zeros(shape, bool), d, n_actions
-        )
+        bootstrap, valid = np.zeros(shape, np.float32), np.zeros(shape, bool)
+        return cls(rows, bootstrap, valid, d, n_actions)
 
     @property
     def capacity(self) -> int:

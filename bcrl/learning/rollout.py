@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bcrl.envs import Env, Success, is_finite, is_simulated, lanes_of
 from bcrl.envs.base import FiniteEnv
 from bcrl.learning import Booleans, Floats, Integers
-from bcrl.learning.policies import greedy, uniform, walk
+from bcrl.learning.policies import greedy, walk
 from bcrl.q.functions import NOT_FINITE, Q, Table, query, rows_of
 
 AT_ONCE = (4, 32)  # seeds, and episodes of each, whose simulators exist at a time
@@ -91,7 +91,7 @@ def rollout(env: Env, q: Q, start: Floats, u: Floats, epsilon: float = 0.0) -> E
     failed: dict[int, str] = {}
 
     def epsilon_greedy(states: NDArray, u: NDArray, alive: NDArray) -> NDArray:
-        action = uniform(env.n_actions, u[..., 1])
+        action = (u[..., 1] * env.n_actions).astype(np.intp)
         exploit = alive & (u[..., 0] >= epsilon)
         if exploit.any():  # Q may be expensive: query it only where it decides
             queried = [x[lanes] for x, lanes in zip(states, exploit, strict=True)]

@@ -37,7 +37,7 @@ class Learner(Protocol):
     ) -> Iterator["Pause"]:
         """Learn `stage` from `start`; yields pauses, the last one a `Snapshot`.
 
-        With the `state` of a pause it resumes there, as if never interrupted.
+        With the `state` of a pause it resumes there.
         """
 
 

@@ -16,18 +16,10 @@ from bcrl.q.regressors.ours import ForestRegressor, Tabular
 from tests.toys import Corridor, OpenCorridor
 
 
-def stages(
-    tasks,
-    transfers=(warm_start,),
-    regressor=None,
-    iterations=120,
-    new_data=(True, True),
-    **options,
-):
-    made = []
+def stages(tasks, transfers=(warm_start,), iterations=120, keep_data=False, **options):
+    made, options = [], {"regressor": Tabular()} | options
     for i, env in enumerate(tasks):
-        fits = {"regressor": regressor or Tabular(), "new_data": new_data[i]} | options
-        learner = FQI(iterations, 60, **fits)
+        learner = FQI(iterations, 60, new_data=not (i and keep_data), **options)
         made.append(Stage(i + 1, i + 1, env, learner, transfers, i * iterations))
     return made
 
@@ -68,7 +60,7 @@ def test_tabulated_and_general_evaluation_agree_with_the_same_forests(transfers)
 def test_an_action_never_tried_keeps_its_approximator():
     tasks, probe = [Corridor(), Corridor(prize=5.0)], Corridor().states()
     batch = SeedBatch((0,), probe)
-    first, second = stages(tasks, iterations=3, new_data=(True, False))
+    first, second = stages(tasks, iterations=3, keep_data=True)
     *_, before = learn_stages([first], batch)
     (data,) = before.result.data
     (_, left), right = data.by_action
@@ -80,7 +72,7 @@ def test_an_action_never_tried_keeps_its_approximator():
 
 
 def test_a_kept_dataset_is_not_collected_again():
-    options = {"iterations": 2, "new_data": (True, False), "seeds": (0,)}
+    options = {"iterations": 2, "keep_data": True, "seeds": (0,)}
     snapshots = learn([Corridor()] * 2, warm_start, **options)
     assert snapshots[0].result.data is snapshots[-1].result.data
     assert [x.count for x in snapshots] == [1, 2, 3, 4]

@@ -105,10 +105,7 @@ def least_steps(mass: float) -> Floats:
 
 
 def image_boxes(mass: float) -> tuple[Floats, Floats]:
-    """Lower and upper corners of boxes around each cell's image by each action.
-
-    Shapes (2, CELLS, CELLS, 2); the leading axis is the action.
-    """
+    """Corners of boxes around each cell's image by action, (2, CELLS, CELLS, 2)."""
     axes = [np.linspace(-limit, limit, CELLS + 1) for limit in _LIMITS]
     corners = np.stack(np.meshgrid(*axes, indexing="ij"), -1)[:, :, None]
     image, _, _ = CarOnHill(mass=mass).step(corners, np.arange(2))
