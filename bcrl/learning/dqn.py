@@ -178,15 +178,13 @@ class DQNTrainer:
         """All uniforms of this step, (S, CHOICES + step_noise + initial_noise)."""
         block, at = divmod(self.state.step, DRAW_BLOCK)
         if block != self._block:
-            width = CHOICES + self.env.step_noise + self.env.initial_noise
-            widths = {"exploration": width, "replay": self.settings.batch_size}
-            path, seeds = (self.stage.number, block), self.batch.seeds
-            self._uniforms, picks = (  # (DRAW_BLOCK, S, width)
-                np.stack(
-                    [stream(s, of, *path).random((DRAW_BLOCK, n)) for s in seeds], 1
-                )
-                for of, n in widths.items()
-            )
+            width, found = CHOICES + self.env.step_noise + self.env.initial_noise, []
+            for of, n in (("exploration", width), ("replay", self.settings.batch_size)):
+                rngs = [
+                    stream(s, of, self.stage.number, block) for s in self.batch.seeds
+                ]
+                found.append(np.stack([rng.random((DRAW_BLOCK, n)) for rng in rngs], 1))
+            self._uniforms, picks = found  # (DRAW_BLOCK, S, n)
             self._indices = self.state.replay.indices(picks, at)
             self._block = block
         return self._uniforms[at]
