@@ -40,9 +40,8 @@ class Episodes:
     def solved(self, success: Success | str = "unpunished") -> Booleans:
         """Whether each episode was a success by a rule of `env.success`, (S, E)."""
         rule, threshold = Success(success) if isinstance(success, str) else success
-        last = np.maximum(self.length - 1, 0)[..., None]
-        ended = np.take_along_axis(self.absorbing, last, -1)[..., 0]
-        reward = np.take_along_axis(self.reward, last, -1)[..., 0]
+        last = (*np.indices(self.length.shape), np.maximum(self.length - 1, 0))
+        ended, reward = self.absorbing[last], self.reward[last]
         outcomes: dict[str, Any] = {
             "absorbed": ended,
             "survived": ~ended,

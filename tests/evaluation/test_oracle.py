@@ -68,9 +68,8 @@ def test_search_agrees_with_plain_search_and_needs_no_particular_cover(
 
 
 def test_search_agrees_with_the_published_table():
-    table = np.loadtxt(PUBLISHED, delimiter=",", skiprows=1)
+    table, env = np.loadtxt(PUBLISHED, delimiter=",", skiprows=1), CarOnHill()
     states, published = table[:100, :2], table[:, 3].reshape(2, 100).T
-    env = CarOnHill()
     np.testing.assert_array_equal(states, env.evaluation_states())
     # the table counts failures that are not immediate one step too many
     expected = np.where(published < -1, published + 1, published)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from bcrl.evaluation.oracle.maze import optimal_q
+from bcrl.learning import stage
 from bcrl.learning.fqi import FQI
 from bcrl.learning.rollout import transition_tables
 from bcrl.learning.stage import SeedBatch, Stage
-from bcrl.learning.stage import learn as learn_stages
 from bcrl.learning.transfer import Boost, Shape, begin, warm_start
 from bcrl.q.functions import ZERO, Sum, Table, Zero, add
 from bcrl.q.regressors.ours import ForestRegressor, Tabular
@@ -26,7 +26,7 @@ def stages(tasks, transfers=(warm_start,), iterations=120, keep_data=False, **op
 
 def learn(tasks, *transfers, seeds=(0, 1), **options):
     batch = SeedBatch(seeds, Corridor().states())
-    return list(learn_stages(stages(tasks, transfers, **options), batch))
+    return list(stage.learn(stages(tasks, transfers, **options), batch))
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_an_action_never_tried_keeps_its_approximator():
     tasks, probe = [Corridor(), Corridor(prize=5.0)], Corridor().states()
     batch = SeedBatch((0,), probe)
     first, second = stages(tasks, iterations=3, keep_data=True)
-    *_, before = learn_stages([first], batch)
+    *_, before = stage.learn([first], batch)
     (data,) = before.result.data
     (_, left), right = data.by_action
     data = [replace(data, by_action=[(np.empty(0, np.intp), left), right])]

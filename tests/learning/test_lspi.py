@@ -172,14 +172,6 @@ def test_what_an_iteration_collects(drop):
     assert not np.array_equal(z[:, 0], again[:, 0])  # its own data, every iteration
 
 
-def test_a_seed_alone_is_the_same_among_others():
-    for one, among in zip(iterations((3,)), iterations(range(5)), strict=True):
-        assert np.array_equal(gains(one, 1)[0], gains(among, 5)[3])
-        at = np.random.default_rng(0).standard_normal((5, 1, 4))
-        values = one.result.q(at[3:4], 8), among.result.q(at, 8)
-        assert np.array_equal(values[0][0], values[1][3])
-
-
 def test_steps_that_are_not_whole_episodes_are_rejected():
     learner = LSPI(iterations=2, steps=300)
     assert learner.episodes_per_iteration(replace(LQ, horizon=50)) == 3

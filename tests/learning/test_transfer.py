@@ -60,13 +60,6 @@ def test_the_target_of_each_boost_by_hand(boost, expected):
         assert np.allclose(target(BASE, NEXT_BASE, boost), equation_5)
 
 
-def test_the_shaping_term_by_hand():
-    value, after = np.array([4.0, 4.0]), np.array([6.0, 6.0])
-    done = np.array([False, True])
-    assert shaping(value, after, done, 0.5, True).tolist() == [-1.0, -4.0]
-    assert shaping(value, after, done, 0.5, False).tolist() == [-1.0, -1.0]
-
-
 class Known:
     """V(s) = 7 x + 3 y + 40, and Q(s, a) = V(s) − distance of a to the `best`."""
 
@@ -186,11 +179,9 @@ def test_the_prior_acts_with_probability_nu_to_the_step(step, nu, epsilon):
     run = run_of(StageInit(prior=Known(5), behavior=PolicyReuse(nu)))
     run.state.step, n = step, 4000
     u = np.random.default_rng(step).random((1, n, 3))
-    residual, prior = (
-        np.broadcast_to(-np.abs(np.arange(8.0) - best), (1, n, 8)) for best in (2, 5)
-    )
-    frozen = (np.zeros((1, n, 8)), None, prior)
-    own, done = run._choose(residual, frozen, u, epsilon)
+    states = np.zeros((1, n, 4))
+    frozen = (np.zeros((1, n, 8)), None, Known(5)(states, 8))
+    own, done = run._choose(Known(2)(states, 8), frozen, u, epsilon)
     random, follow = u[0, :, 0] < epsilon, u[0, :, 2] < nu**step
     free = np.where(random, np.floor(8 * u[0, :, 1]), 2)
     assert np.array_equal(done[0], np.where(follow, 5, free))
