@@ -64,8 +64,8 @@ class SeedProbe:
 
     def place(self, snapshot: Snapshot) -> dict[str, int]:
         """The first columns of a snapshot's rows: stage, task and count."""
-        stage, task = snapshot.stage.number, snapshot.stage.task
-        return {"stage": stage, "task": task, self.index: snapshot.count}
+        stage = snapshot.stage
+        return {"stage": stage.number, "task": stage.task, self.index: snapshot.count}
 
     def shown(self, episodes: rollout.Episodes, s: int, e: int) -> dict[str, NDArray]:
         """Episode e of the seed with index s, and the scene, as the NPZ stores them."""

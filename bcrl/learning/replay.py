@@ -33,6 +33,7 @@ class Replay:
 
     def __post_init__(self) -> None:
         # NumPy's assignment costs a tenth of torch's; on a CPU the memory is the same.
+        self.capacity = self.rows.shape[1]  # transitions of each seed that fit in
         self._host = (self.rows if self.rows.is_cpu else self.rows[:, :1].cpu()).numpy()
 
     @classmethod
@@ -44,11 +45,6 @@ class Replay:
         rows = torch.zeros((*shape, 2 * d + n_actions + 3), device=device)
         bootstrap, valid = np.zeros(shape, np.float32), np.zeros(shape, bool)
         return cls(rows, bootstrap, valid, d, n_actions)
-
-    @property
-    def capacity(self) -> int:
-        """Transitions of each seed that fit in."""
-        return self.rows.shape[1]
 
     @property
     def size(self) -> int:
