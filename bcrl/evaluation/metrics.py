@@ -1,6 +1,5 @@
 """Probes measure snapshots of some seeds; here also what FQI's iterations are asked."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache
 from typing import Any, ClassVar, NamedTuple
@@ -27,7 +26,7 @@ class View(NamedTuple):
     start: Integers  # (E,) the starts of the episodes among the probed states
     reference: Integers  # (n,) the states with a known Q* among the probed states
     q_star: Floats  # (n, A) Q* of the trained task there
-    optimum: float  # V*(s0) of the *target* task, nan if unknown
+    optimum: float  # V*(s0) of the *target* task; None if unknown
 
 
 #: name in the CSV → its definition (docs/reference/metrics.md explains them)
@@ -52,43 +51,30 @@ def check_metrics(metrics: Sequence[str], target: Env) -> None:
         raise ConfigError("env.metrics", "q_error_start", why)
 
 
-class SeedProbe(ABC):
+class SeedProbe:
     """Measures the snapshots of several seeds, and keeps what each stage ends with."""
 
     index: ClassVar[str]  # the CSV's name for a snapshot's count
-    shown: tuple[rollout.Episodes, int]  # final episodes of all seeds; which to store
 
     def __init__(self, seeds: Sequence[int], tasks: Sequence[Any]) -> None:
-        self.seeds, self.tasks = seeds, tasks
-        self.target = tasks[-1]
+        self.seeds, self.tasks, self.target = seeds, tasks, tasks[-1]
         self.kept: list[Any] = []  # by stage, recorded at its end; checkpoints store it
         #: Seeds, by index, that can't continue after the latest measurement, and why.
         self.failed: dict[int, str] = {}
 
-    @abstractmethod
-    def measure(self, snapshot: Any) -> list[dict[str, float]]:
-        """Each seed's metrics, by column of the CSV."""
-
-    @abstractmethod
-    def final(self, s: int) -> dict[str, NDArray]:
-        """`states` (n, d), and what the seed with index s has learned there."""
-
-    @abstractmethod
-    def facts(self) -> dict[str, Any]:
-        """What the metadata says about the measurements."""
-
     def place(self, snapshot: Snapshot) -> dict[str, int]:
         """The first columns of a snapshot's rows: stage, task and count."""
-        stage, task = snapshot.stage.number, snapshot.stage.task
-        return {"stage": stage, "task": task, self.index: snapshot.count}
+        stage = snapshot.stage
+        return {"stage": stage.number, "task": stage.task, self.index: snapshot.count}
 
-    def arrays(self, s: int) -> dict[str, NDArray]:
-        """The NPZ of the seed with index s: what it learned, an episode, the scene."""
-        (episodes, e), target = self.shown, self.target
-        length, found = episodes.length[s, e], self.final(s)
-        found["trajectory"] = episodes.state[s, e, : length + 1]  # (T + 1, d)
-        found["trajectory_actions"] = episodes.action[s, e, :length]  # (T,) or (T, k)
-        found["trajectory_start"] = episodes.start[s, e]  # what reset a simulator
+    def shown(self, episodes: rollout.Episodes, s: int, e: int) -> dict[str, NDArray]:
+        """Episode e of the seed with index s, and the scene, as the NPZ stores them."""
+        length, target = episodes.length[s, e], self.target
+        found = {
+            "trajectory": episodes.state[s, e, : length + 1],  # (T + 1, d)
+            "trajectory_actions": episodes.action[s, e, :length],  # (T,) or (T, k)
+            "trajectory_start": episodes.start[s, e],  # what reset a simulator
+        }
         if hasattr(target, "walls"):
             walls = np.stack([task.walls for task in self.tasks])
             return found | {"walls": walls, "goal": target.goal}
@@ -106,12 +92,10 @@ class Probe(SeedProbe):
         super().__init__(seeds, tasks)
         self.metrics, self.states = metrics, probed_states(self.target)
 
-    @cached_property
-    def optimum(self) -> float | None:
-        """V*(s0) of the target, if the oracle knows the only evaluation state."""
         start, reference, q_star = _layout(self.target, self.target)
-        q = q_star[reference == start[0]]
-        return float(q.max()) if len(start) == 1 and len(q) else None
+        known = len(start) == 1 and (reference == start).any()
+        #: V*(s0) of the target, if the oracle knows the only evaluation state.
+        self.optimum = float(q_star[reference == start].max()) if known else None
 
     def measure(self, snapshot: Iteration) -> list[dict[str, float]]:
         """Each seed's metrics; only a simulator's episodes have random starts."""
@@ -129,9 +113,8 @@ class Probe(SeedProbe):
             self._last = snapshot
         returns = episodes.discounted_return(env.gamma)
         solved = episodes.solved(rollout.success_of(env))
-        optimum = np.nan if self.optimum is None else self.optimum
-        known = (*_layout(env, self.target), optimum)
         learned = (snapshot.probed_q, snapshot.probed_residual, returns, solved)
+        known = (*_layout(env, self.target), self.optimum)
         rows = []
         for s, outcome in enumerate(zip(*learned, strict=True)):
             view = View(*outcome, *known)
@@ -139,21 +122,23 @@ class Probe(SeedProbe):
             rows.append(dict.fromkeys(row, np.nan) if s in self.failed else row)
         return rows
 
-    def final(self, s: int) -> dict[str, NDArray]:
+    def arrays(self, s: int) -> dict[str, NDArray]:
+        """The NPZ of the seed with index s: what it learned, an episode, the scene."""
         residuals = np.stack([residual[s] for residual in self.kept])
-        q = self._last.probed_q[s]
-        return {"states": self.states, "q": q, "residuals": residuals}
+        found = {"states": self.states, "q": self._last.probed_q[s]}
+        return found | {"residuals": residuals} | self.shown(self._episodes, s, 0)
 
     @cached_property
-    def shown(self) -> tuple[rollout.Episodes, int]:
+    def _episodes(self) -> rollout.Episodes:
         """A greedy episode in the target task, the evaluation's if it has only one."""
         rngs = [stream(seed, "evaluation", self._last.count) for seed in self.seeds]
         start, u = rollout.starts_and_draws(rngs, self.target, 1)
         episodes = rollout.rollout(self.target, self._last.result.q, start, u)
         self.failed = episodes.failed | self.failed
-        return episodes, 0
+        return episodes
 
     def facts(self) -> dict[str, Any]:
+        """What the metadata says about the measurements."""
         return {"optimum": self.optimum}
 
 
@@ -162,8 +147,9 @@ def probed_states(target: Env) -> Floats:
     """All states of an env that lists them, else those that metrics need, (n, d)."""
     if hasattr(target, "states"):
         return target.states()
-    known = oracle.reference(target)
-    needed = [target.evaluation_states()] + ([known.states] if known else [])
+    needed = [target.evaluation_states()]
+    if known := oracle.reference(target):
+        needed.append(known.states)
     return np.unique(np.concatenate(needed), axis=0)
 
 
@@ -178,9 +164,8 @@ def _layout(env: Env, target: Env) -> tuple[Integers, Integers, Floats]:
             raise BcrlError(f"{env}: its evaluation states are not the target's")
         return match.argmax(1)
 
-    known = oracle.reference(env)
     # A simulator's starts are random: Q is recorded where the target may start.
     start = rows((target if is_simulated(env) else env).evaluation_states())
-    if known is None:
+    if (known := oracle.reference(env)) is None:
         return start, np.empty(0, np.intp), np.empty((0, env.n_actions))
     return start, rows(known.states), known.q

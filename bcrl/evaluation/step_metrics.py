@@ -15,15 +15,13 @@ from bcrl.learning.stage import StepSnapshot
 def evaluate(
     now: StepSnapshot, seeds: Sequence[int]
 ) -> tuple[list[dict[str, float]], Episodes]:
-    """Each seed's columns (docs/reference/metrics.md), in the stage's unshaped task.
+    """Each seed's columns (docs/reference/metrics.md) in the unshaped task.
 
     Also their episodes: exploring ones, then greedy ones, from the same starts and with
-    the same noise. These depend on seed, stage and step alone: evaluation does not
-    change training.
+    the same noise. These depend on seed, stage and step alone.
     """
-    env, n = now.stage.env, now.episodes
-    path = (now.stage.number, now.count - now.stage.before)
-    rngs = [stream(seed, "evaluation", *path) for seed in seeds]
+    env, n, step = now.stage.env, now.episodes, now.count - now.stage.before
+    rngs = [stream(seed, "evaluation", now.stage.number, step) for seed in seeds]
     start, u = starts_and_draws(rngs, env, n, CHOICES)
     played = play(env, now.policy, np.tile(start, (1, 2, 1)), np.tile(u, (1, 1, 2, 1)))
     outcomes = {
@@ -59,15 +57,19 @@ class StepProbe(SeedProbe):
         rows, played = evaluate(snapshot, self.seeds)
         self.failed = played.failed | snapshot.failed
         if snapshot.last_of_stage:
-            self.shown = played, snapshot.episodes  # the first greedy one
+            self._played = played
             states = np.broadcast_to(self.states, (len(rows), *self.states.shape))
             q = snapshot.result.q(states, snapshot.stage.env.n_actions)
             self.kept.append((snapshot.stage.learner.name, np.asarray(q, np.float32)))
         return rows
 
-    def final(self, s: int) -> dict[str, NDArray]:
-        stages = np.stack([q[s] for _, q in self.kept])
-        return {"states": self.states, "q": stages[-1], "q_stages": stages}
+    def arrays(self, s: int) -> dict[str, NDArray]:
+        """The NPZ of the seed with index s: what it learned, an episode, the scene."""
+        stages, played = np.stack([q[s] for _, q in self.kept]), self._played
+        found = {"states": self.states, "q": stages[-1], "q_stages": stages}
+        first_greedy = played.length.shape[1] // 2
+        return found | self.shown(played, s, first_greedy)
 
     def facts(self) -> dict[str, Any]:
+        """What the metadata says about the measurements."""
         return {"learners": [name for name, _ in self.kept]}

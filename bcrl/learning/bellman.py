@@ -31,7 +31,6 @@ def precompute_target(
     The target is c + discount · max_a' (ϱ + b)(s', a'). With `one` maximum and the mask
     it is `residual_target`. With `two` it bootstraps with max ϱ(s') + max base(s').
     Without the mask, max base(s') counts in an absorbing next state, too [released].
-    Shapes as in `residual_target`.
     """
     discount, two = np.where(absorbing, 0.0, gamma), boost.maxima == "two"
     weight = discount if two else np.zeros_like(discount)

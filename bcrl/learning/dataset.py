@@ -13,18 +13,6 @@ from bcrl.learning.rollout import Episodes, transition_tables
 
 @storable
 @dataclass(frozen=True)
-class ActionRows:
-    """The regression problem of one action: its n rows, and all other points."""
-
-    rows: Integers  # (n,) rows of the dataset
-    x: NDArray[np.float32]  # (n, d) their states
-    multiplicity: NDArray[np.int64]  # (n,) how often each row was seen
-    queries: NDArray[np.float32]  # (m, d) the points without a row
-    query_points: Integers  # (m,) their indices in the dataset's points
-
-
-@storable
-@dataclass(frozen=True)
 class Dataset:
     """One seed's transitions; states are indices of `points`.
 
@@ -40,42 +28,33 @@ class Dataset:
     next_state: Integers  # (n,)
     absorbing: Booleans  # (n,)
     multiplicity: NDArray[np.int64]  # (n,)
-    by_action: tuple[ActionRows, ...]
+    by_action: list[tuple[Integers, Integers]]  # its rows; the points without one
 
 
-def build(env: Env, episodes: Episodes, seed: int, probe: NDArray) -> Dataset:
-    """The dataset of the seed with index `seed`, with `probe` (n, d) among its points.
-
-    Shapes as in `Dataset` and `Episodes`.
-    """
+def build(env: Env, episodes: Episodes, seed: int, probe: Floats) -> Dataset:
+    """The dataset of the seed with index `seed`; `probe` (n, d) is among its points."""
     seen = np.arange(episodes.reward.shape[-1]) < episodes.length[seed][:, None]
     before = episodes.state[seed, :, :-1][seen]  # (n, d)
     action = episodes.action[seed][seen]
     if is_finite(env):
         points, probed = env.states().astype(np.float32), env.index(probe)
-        counts = np.bincount(env.index(before) * env.n_actions + action)
-        pairs = np.flatnonzero(counts)
-        count = counts[pairs]
-        state, action = np.divmod(pairs, env.n_actions)
+        pairs = env.index(before) * env.n_actions + action
+        pairs, count = np.unique(pairs, return_counts=True)
+        state, action = at = np.divmod(pairs, env.n_actions)
         to, pays, ends = transition_tables(env)
-        next_state, reward = to[state, action], pays[state, action]
-        absorbing = ends[state, action]
+        next_state, reward, absorbing = to[at], pays[at], ends[at]
     else:
-        after = episodes.state[seed, :, 1:][seen]
+        after, n = episodes.state[seed, :, 1:][seen], len(before)
         every = np.concatenate([before, after, probe]).astype(np.float32)
         points, label = np.unique(every, axis=0, return_inverse=True)
-        label = label.reshape(-1)
-        state, next_state, probed = np.split(label, [len(before), 2 * len(before)])
-        reward = episodes.reward[seed][seen]
-        absorbing = episodes.absorbing[seed][seen]
+        state, next_state, probed = np.split(label.reshape(-1), [n, 2 * n])
+        reward, absorbing = episodes.reward[seed][seen], episodes.absorbing[seed][seen]
         count = np.ones(len(state), np.int64)  # a continuum seldom repeats
     by_action = []
     for a in range(env.n_actions):
-        rows = np.flatnonzero(action == a)
-        rest = np.setdiff1d(np.arange(len(points)), state[rows])
-        x = points[state[rows]]
-        by_action.append(ActionRows(rows, x, count[rows], points[rest], rest))
-    parts = tuple(by_action)
+        own = np.flatnonzero(action == a)
+        others = np.setdiff1d(np.arange(len(points)), state[own])
+        by_action.append((own, others))
     return Dataset(
-        points, probed, state, action, reward, next_state, absorbing, count, parts
+        points, probed, state, action, reward, next_state, absorbing, count, by_action
     )

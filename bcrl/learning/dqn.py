@@ -6,7 +6,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from bcrl.common.seeding import stream
 from bcrl.common.serialization import storable
@@ -68,8 +67,7 @@ class DQN:
     ) -> Iterator[Pause]:
         """Learn a stage; yields before the first step and after each.
 
-        Snapshots come before the first step that is not random, after every
-        `evaluate_every` steps and after the last.
+        Snapshots come before the first step that is not random, and then regularly.
         """
         run = DQNTrainer(self, stage, start, batch, state)
         if state is None:
@@ -96,26 +94,27 @@ class DQNState:
     loss: Floats  # (S,) summed over the updates since the last snapshot
     updates: int = 0  # since the last snapshot
     step: int = 0  # steps done in this stage
-    residual: NDArray | None = None  # (S, A) ϱ at `env_state`, if computed
+    residual: Any = None  # (S, A) ϱ at `env_state`, if computed
 
 
-@dataclass(eq=False)
 class DQNTrainer:
     """S seeds in the middle of a stage, each with its environment and networks."""
 
-    settings: DQN
-    stage: Stage
-    start: StageInit
-    batch: SeedBatch
-    state: Any = None  # the `DQNState` of a pause, or a new one
-
-    def __post_init__(self) -> None:
-        self.env, self.n_actions = self.stage.env, self.stage.env.n_actions
-        self.state = now = self.state or self._initial_state()
+    def __init__(
+        self,
+        of: DQN,
+        stage: Stage,
+        start: StageInit,
+        batch: SeedBatch,
+        state: Any = None,
+    ) -> None:
+        self.settings, self.stage, self.start, self.batch = of, stage, start, batch
+        self.env, self.n_actions = stage.env, stage.env.n_actions
+        self.state = now = state or self._initial_state()
         updater = one_by_one if now.replay.rows.is_cpu else batched
         self._gradient_step = updater(now.deep, now.replay)
-        self._frozen = self._frozen_at(now.env_state)
-        if isinstance(self.start.behavior, ResidualPolicy):
+        self._frozen = self._frozen_at(now.env_state)  # before the present step
+        if isinstance(start.behavior, ResidualPolicy):
             self._combined = combined_actions(self.env.actions)
         self._block = -1  # the block whose uniforms are drawn
 
@@ -123,9 +122,9 @@ class DQNTrainer:
         """The state before the first step; new networks unless warm-started."""
         env, settings, number = self.env, self.settings, self.stage.number
         seeds, device, n = self.batch.seeds, self.batch.device, len(self.batch.seeds)
-        rngs = [stream(seed, "exploration", number) for seed in seeds]
-        lanes = lanes_of(env)
+        rngs = (stream(seed, "exploration", number) for seed in seeds)
         noise = np.stack([rng.random(env.initial_noise) for rng in rngs])
+        lanes = lanes_of(env)
         env_state = lanes.begin(env.initial(noise))
         if isinstance(self.start.initial, DeepQ):
             deep = self.start.initial.clone()
@@ -163,11 +162,9 @@ class DQNTrainer:
             v, next_v = potential.max(-1), next_potential.max(-1)
             zero = start.shape.zero_at_goal
             reward = reward + shaping(v, next_v, absorbing, env.gamma, zero)
-        base_sa, gamma = base[np.arange(len(own)), own], env.gamma
-        target = precompute_target(
-            reward, absorbing, next_base, base_sa, gamma, start.boost
-        )
-        now.replay.add(now.env_state, next_state, *target, own)
+        now_base = base[np.arange(len(own)), own]
+        known = (reward, absorbing, next_base, now_base, env.gamma, start.boost)
+        now.replay.add(now.env_state, next_state, *precompute_target(*known), own)
         now.steps_in_episode += 1
         over = absorbing | cut | (now.steps_in_episode == env.horizon)
         if over.any():
@@ -181,17 +178,16 @@ class DQNTrainer:
         """All uniforms of this step, (S, CHOICES + step_noise + initial_noise)."""
         block, at = divmod(self.state.step, DRAW_BLOCK)
         if block != self._block:
-            width = CHOICES + self.env.step_noise + self.env.initial_noise
-            self._uniforms = self._drawn("exploration", block, width)
-            picks = self._drawn("replay", block, self.settings.batch_size)
+            width, found = CHOICES + self.env.step_noise + self.env.initial_noise, []
+            for of, n in (("exploration", width), ("replay", self.settings.batch_size)):
+                rngs = [
+                    stream(s, of, self.stage.number, block) for s in self.batch.seeds
+                ]
+                found.append(np.stack([rng.random((DRAW_BLOCK, n)) for rng in rngs], 1))
+            self._uniforms, picks = found  # (DRAW_BLOCK, S, n)
             self._indices = self.state.replay.indices(picks, at)
             self._block = block
         return self._uniforms[at]
-
-    def _drawn(self, purpose: str, block: int, width: int) -> Floats:
-        """A block's uniforms (DRAW_BLOCK, S, width)."""
-        rngs = (stream(s, purpose, self.stage.number, block) for s in self.batch.seeds)
-        return np.stack([rng.random((DRAW_BLOCK, width)) for rng in rngs], 1)
 
     def _values(self, q: Any, state: Floats) -> Floats:
         """Values (S, A) of a Q-function at one state (S, d) of each seed."""
@@ -222,13 +218,12 @@ class DQNTrainer:
         if not isinstance(behavior, ResidualPolicy):
             return own, own
         advised = greedy(prior, u[..., 2])
-        copying = now.n_greedy_decisions < behavior.offset  # (S,)
-        copying = copying.reshape(-1, *[1] * (own.ndim - 1))
-        own = np.where(copying & (u[..., 0] >= epsilon), advised, own)
+        copying = (now.n_greedy_decisions < behavior.offset) & (u[..., 0] >= epsilon).T
+        own = np.where(copying.T, advised, own)
         return own, self._combined[advised, own]
 
     def update(self) -> None:
-        """One gradient step per seed, each on a separate batch."""
+        """One gradient step for each seed, on a batch of its own."""
         now, target_update = self.state, self.settings.target_update
         at, since = now.step % DRAW_BLOCK, now.deep.steps % target_update
         # After a copy of the target (or a new block) the batches until the next one.
@@ -261,16 +256,17 @@ class DQNTrainer:
         weights = torch.isfinite(now.deep.online.flat).all(1).cpu().numpy()
         failed: dict[int, str] = {}
         for part, finite in (("loss", np.isfinite(now.loss)), ("weights", weights)):
-            lost = np.flatnonzero(~finite).tolist()
-            failed |= dict.fromkeys(lost, f"non-finite {part}")
+            failed |= dict.fromkeys(
+                np.flatnonzero(~finite).tolist(), f"non-finite {part}"
+            )
         loss = now.loss / now.updates if now.updates else now.loss + np.nan
         now.loss, now.updates = np.zeros_like(loss), 0
         result = StageResult(self.start.total(now.deep), now.deep)
         measured = (self._evaluated_policy, self.settings.evaluation_episodes, loss)
-        failed |= now.lanes.failures  # one lane per seed
+        failed |= now.lanes.failures  # each seed has one lane
         return StepSnapshot(self.stage, count, now, result, *measured, failed=failed)
 
-    def _evaluated_policy(self, states: Any, u: NDArray, alive: NDArray) -> NDArray:
+    def _evaluated_policy(self, states: Any, u: Floats, alive: Any) -> Integers:
         """A `Policy`: half of the lanes explore, the other half is greedy.
 
         Greedy lanes do not reuse the prior (PPR).
@@ -278,8 +274,6 @@ class DQNTrainer:
         start, settings = self.start, self.settings
         exploring = np.repeat([True, False], settings.evaluation_episodes)
         epsilon = np.where(exploring, settings.evaluation_epsilon, 0.0)
-        base = start.base(states, self.n_actions)  # (S, E, A)
-        same = start.prior is start.base
-        prior = base if same else start.prior(states, self.n_actions)
-        residual = self.state.deep(states, self.n_actions)
+        parts = (self.state.deep, start.base, start.prior)
+        residual, base, prior = (q(states, self.n_actions) for q in parts)  # (S, E, A)
         return self._choose(residual, (base, None, prior), u, epsilon, exploring)[1]

@@ -42,8 +42,7 @@ class FQI:
     """Fitted Q-iteration for many seeds at once (Ernst et al. 2005; paper, Eq. 5).
 
     Every iteration fits, for each seed and action, a new regressor to
-    r + γ max_a' Q(s', a') − base(s, a). All that is constant within a stage is computed
-    once: the distinct points, each action's rows, the base's values, shaped rewards.
+    r + γ max_a' Q(s', a') − base(s, a). What is constant in a stage is computed once.
     """
 
     iterations: int
@@ -95,24 +94,23 @@ class FQI:
             for s, d in enumerate(data):
                 if s in failed:  # a failed seed keeps its last finite ϱ
                     continue
-                q = base[s] + residual[s]  # (P, A)
-                base_sa = base[s][d.state, d.action]  # (n,)
-                y = residual_target(
-                    reward[s], d.absorbing, q[d.next_state], base_sa, env.gamma
-                )
-                for a, part in enumerate(d.by_action):
+                next_q = (base[s] + residual[s])[d.next_state]  # (n, A)
+                now = base[s][d.state, d.action]  # (n,)
+                y = residual_target(reward[s], d.absorbing, next_q, now, env.gamma)
+                for a, (rows, others) in enumerate(d.by_action):
                     path = () if self.fixed_trees else (stage.number, k, a)
-                    rows = (part.x, y[part.rows], part.multiplicity, part.queries)
-                    if len(part.rows):  # an action that was never tried has no model
-                        problems[s, a] = Problem(*rows, batch.seeds[s], path)
+                    x, counts = d.points[d.state[rows]], d.multiplicity[rows]
+                    fitted = (x, y[rows], counts, d.points[others])
+                    if len(rows):  # an action that was never tried has no model
+                        problems[s, a] = Problem(*fitted, batch.seeds[s], path)
             keep = not is_finite(env)  # a table is not queried between its points
             fits, lost = fit_each(self.regressor, problems, keep, batch.threads)
             failed = lost | failed
             residual = [values.copy() for values in residual]
             for (s, a), fit in fits.items():
-                part = data[s].by_action[a]
-                residual[s][data[s].state[part.rows], a] = fit.fitted
-                residual[s][part.query_points, a] = fit.queried
+                rows, others = data[s].by_action[a]
+                residual[s][data[s].state[rows], a] = fit.fitted
+                residual[s][others, a] = fit.queried
                 models[s][a] = Fitted.of(problems[s, a], fit)
             total = [b + r for b, r in zip(base, residual, strict=True)]
             if start.shape is not None:
@@ -125,12 +123,12 @@ class FQI:
                 own = FittedQ([tuple(row) for row in models], self.regressor, batch)
                 last = start if k == self.iterations else cached
                 result = StageResult(last.total(own), own, data)
-            now, count = FQIState(k, data, residual, failed), stage.before + k
+            after, count = FQIState(k, data, residual, failed), stage.before + k
             probed = (
                 [values[d.probe] for values, d in zip(each, data, strict=True)]
                 for each in (total, residual)
             )
-            yield Iteration(stage, count, now, result, *probed, failed=failed)
+            yield Iteration(stage, count, after, result, *probed, failed=failed)
 
     def _collect(self, stage: Stage, start: StageInit, batch: SeedBatch) -> FQIState:
         """The state before the first iteration, with a dataset for each seed."""

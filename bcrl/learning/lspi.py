@@ -2,10 +2,10 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bcrl.common.arrays import ndtri
 from bcrl.common.seeding import stream
@@ -13,7 +13,7 @@ from bcrl.common.serialization import storable
 from bcrl.envs.base import ContinuousEnv, Env
 from bcrl.errors import ConfigError
 from bcrl.learning import Floats
-from bcrl.learning.rollout import Policy, play, starts_and_draws
+from bcrl.learning.rollout import play, starts_and_draws
 from bcrl.learning.stage import SeedBatch, Stage, StepSnapshot
 from bcrl.learning.transfer import StageInit, StageResult
 from bcrl.q.functions import ZERO, Q
@@ -37,9 +37,7 @@ class LSPI:
 
     Each iteration collects its share of the `steps` in whole episodes with the current
     gain, solves LSTDQ on these alone and sets K ← −Quu⁻¹ Qus. `features`: see
-    `bcrl.q.quadratic`. `drop_last` leaves each episode's last step out [released]. A
-    seed fails if its gain is not finite, or if a force grows with its position, away
-    from the goal.
+    `bcrl.q.quadratic`. `drop_last` leaves each episode's last step out [released].
     """
 
     iterations: int = 4
@@ -60,8 +58,7 @@ class LSPI:
         """Episodes per iteration; ConfigError unless `steps` are whole episodes."""
         episodes, rest = divmod(self.steps, self.iterations * env.horizon)
         if rest or not episodes:
-            unit = f"{self.iterations} iterations x {env.horizon} steps"
-            why = f"LSPI needs a multiple of {unit}"
+            why = f"must be a multiple of {self.iterations} x {env.horizon} for LSPI"
             raise ConfigError("algorithm.steps", self.steps, why)
         return episodes
 
@@ -80,16 +77,15 @@ class LSPI:
             q = Quadratic.from_weights(theta, self.features, d + k, env.actions)
             better = [improved(matrix, env) for matrix in q.matrix]
             gain = np.stack([np.zeros((k, d)) if x is None else x for x in better])
-            lost = [s for s, x in enumerate(better) if x is None]
             why = f"LSPI found no stabilising gain in iteration {i}"
-            failed = dict.fromkeys(lost, why) | state.failed
+            failed = {s: why for s, x in enumerate(better) if x is None} | state.failed
             state = LSPIState(i, gain, q, failed)
             yield self._snapshot(stage, state)
 
     def _snapshot(self, stage: Stage, state: LSPIState) -> StepSnapshot:
         count = stage.before + state.iteration * self.length // self.iterations
         result, loss = StageResult(state.q, state.q), np.full(len(state.gain), np.nan)
-        policy = _linear(state.gain)  # without noise, so both halves are greedy
+        policy = partial(_act, state.gain, 0.0)  # no noise, so both halves are greedy
         measured = (policy, self.evaluation_episodes, loss)
         return StepSnapshot(stage, count, state, result, *measured, failed=state.failed)
 
@@ -97,16 +93,17 @@ class LSPI:
         self, stage: Stage, gain: Floats, iteration: int, batch: SeedBatch
     ) -> tuple[Floats, Floats, Floats]:
         """Each seed's (s, a) (S, n, m), next (s', K s') and rewards (S, n)."""
-        env, (n, k, d) = stage.env, gain.shape
+        env, (seeds, k, d) = stage.env, gain.shape
         rngs = [stream(x, "data", stage.number, iteration) for x in batch.seeds]
         start, u = starts_and_draws(rngs, env, self.episodes_per_iteration(env), k)
-        episodes = play(env, _linear(gain, self.noise_std), start, u)
-        cut = env.horizon - 1 if self.drop_last else env.horizon
-        state, next_state = (episodes.state[:, :, i : cut + i] for i in (0, 1))
-        z = np.concatenate([state, episodes.action[:, :, :cut]], -1)  # (S, E, T, m)
-        next_z = np.concatenate([next_state, _apply(gain, next_state)], -1)
-        reward = episodes.reward[:, :, :cut].reshape(n, -1)
-        return z.reshape(n, -1, d + k), next_z.reshape(n, -1, d + k), reward
+        played = play(env, partial(_act, gain, self.noise_std), start, u)
+        n = env.horizon - self.drop_last
+        state = played.state[:, :, :n].reshape(seeds, -1, d)
+        next_state = played.state[:, :, 1 : n + 1].reshape(seeds, -1, d)
+        action = played.action[:, :, :n].reshape(seeds, -1, k)
+        z = np.concatenate([state, action], -1)
+        next_z = np.concatenate([next_state, _act(gain, 0.0, next_state)], -1)
+        return z, next_z, played.reward[:, :, :n].reshape(seeds, -1)
 
 
 def lstdq(z: Floats, next_z: Floats, reward: Floats, gamma: float, kind: str) -> Floats:
@@ -125,22 +122,12 @@ def lstdq(z: Floats, next_z: Floats, reward: Floats, gamma: float, kind: str) ->
     return theta
 
 
-def _apply(gain: Floats, state: Floats) -> Floats:
-    """K s of states (S, …, d) for gains (S, k, d), shape (S, …, k)."""
-    lanes = gain.reshape(len(gain), *[1] * (state.ndim - 2), *gain.shape[1:])
-    return (lanes * state[..., None, :]).sum(-1)
-
-
-def _linear(gain: Floats, noise_std: float = 0.0) -> Policy:
-    """The policy a = K s + N(0, noise_std²); its first uniforms are the noise's."""
-
-    def act(states: NDArray, u: NDArray, alive: NDArray) -> NDArray:
-        force = _apply(gain, states)
-        if not noise_std:
-            return force
-        return force + noise_std * ndtri(u[..., : gain.shape[1]])
-
-    return act
+def _act(
+    gain: Floats, noise_std: float, states: Floats, u: Any = None, alive: Any = None
+) -> Floats:
+    """The `Policy` a = K s + N(0, noise_std²); its first uniforms are the noise's."""
+    force = (gain[:, None] * states[..., None, :]).sum(-1)
+    return force + noise_std * ndtri(u[..., : gain.shape[1]]) if noise_std else force
 
 
 def improved(matrix: Floats, env: ContinuousEnv) -> Floats | None:

@@ -11,8 +11,10 @@ TIE = 1e-9  # distances between actions that differ by less are equal
 
 
 @numba.njit
-def _best(q, u):
-    """The greatest of q (A,), ties broken by u in [0, 1); 0 if NaN hides it."""
+def _choice(q, explore, u, epsilon):
+    """⌊u A⌋ if `explore` is below ε, else the greatest of q (A,); 0 if NaN hides it."""
+    if explore < epsilon:
+        return int(u * len(q))
     best, ties = q[0], 1
     for a in range(1, len(q)):
         if q[a] > best:
@@ -32,16 +34,17 @@ def _best(q, u):
 def _choices(q, explore, u, epsilon):
     action = np.empty(len(q), np.intp)
     for i in range(len(q)):
-        action[i] = int(u[i] * q.shape[1])
-        if explore[i] >= epsilon[i % len(epsilon)]:
-            action[i] = _best(q[i], u[i])
+        action[i] = _choice(q[i], explore[i], u[i], epsilon[i % len(epsilon)])
     return action
 
 
 def epsilon_greedy(
     q: Floats, explore: Floats, u: Floats, epsilon: Floats | float
 ) -> Integers:
-    """`uniform` where `explore` (...) is below ε (a number, or one per last index)."""
+    """The action ⌊u A⌋ where `explore` (...) is below ε, elsewhere the `greedy` one.
+
+    ε: one number, or one for each last index.
+    """
     rows = writable(q).reshape(-1, q.shape[-1])
     drawn = (np.array(x, np.float64, order="C").ravel() for x in (explore, u, epsilon))
     return _choices(rows, *drawn).reshape(u.shape)
@@ -50,11 +53,6 @@ def epsilon_greedy(
 def greedy(q: Floats, u: Floats) -> Integers:
     """The best action of q (..., A); ties are broken uniformly by u (...) in [0, 1)."""
     return epsilon_greedy(q, u, u, 0.0)
-
-
-def uniform(n_actions: int, u: Floats) -> Integers:
-    """A uniformly random action from each u (...) in [0, 1)."""
-    return (u * n_actions).astype(np.intp)
 
 
 def combined_actions(actions: Floats) -> Integers:
@@ -88,9 +86,7 @@ def walk(next_row, reward, absorbing, q, first, u, epsilon):
         row[e, 0] = at
         for t in range(horizon):
             if not done:
-                act = int(u[t, e, 1] * q.shape[1])
-                if u[t, e, 0] >= epsilon:
-                    act = _best(q[at], u[t, e, 1])
+                act = _choice(q[at], u[t, e, 0], u[t, e, 1], epsilon)
                 action[e, t] = act
                 length[e] = t + 1
                 at, done = next_row[at, act], absorbing[at, act]

@@ -1,7 +1,5 @@
 """A replay buffer for S seeds, and the gradient steps that learn from it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -35,22 +33,18 @@ class Replay:
 
     def __post_init__(self) -> None:
         # NumPy's assignment costs a tenth of torch's; on a CPU the memory is the same.
+        self.capacity = self.rows.shape[1]  # transitions of each seed that fit in
         self._host = (self.rows if self.rows.is_cpu else self.rows[:, :1].cpu()).numpy()
 
     @classmethod
     def empty(
         cls, n_seeds: int, capacity: int, d: int, n_actions: int, device: str
-    ) -> Replay:
+    ) -> "Replay":
         """A replay without transitions."""
         shape = (n_seeds, capacity)
         rows = torch.zeros((*shape, 2 * d + n_actions + 3), device=device)
-        bootstrap, valid = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
+        bootstrap, valid = np.zeros(shape, np.float32), np.zeros(shape, bool)
         return cls(rows, bootstrap, valid, d, n_actions)
-
-    @property
-    def capacity(self) -> int:
-        """Transitions of each seed that fit in."""
-        return self.rows.shape[1]
 
     @property
     def size(self) -> int:
@@ -79,31 +73,30 @@ class Replay:
 
 
 #: (indices (T, S, B), next states (S, d)) → losses (S,), and ϱ's values (S, A) at these
-#: states, or None. One gradient step from the first of T batches; the others belong to
-#: the steps before the target network changes. The loss is the mean of a batch's
-#: smooth-L1 errors. No seed's result depends on the other seeds.
+#: states, or None. One gradient step on the mean smooth-L1 error of the first of T
+#: batches; the others belong to the steps before the target network changes. No seed's
+#: result depends on the other seeds.
 Update = Callable[[NDArray, Floats], tuple[Floats, NDArray[np.float32] | None]]
 
 
 def batched(deep: DeepQ, replay: Replay) -> Update:
     """Stacked matrix products in torch, on any device."""
-    online, target, device = deep.online, deep.target, deep.online.flat.device
+    online, target, device = deep.online, deep.target, replay.rows.device
     seed = torch.arange(len(online.flat), device=device)[:, None]
     widths = [replay.d, replay.d, replay.n_actions, 1, 1, 1]
     gradient = Networks(online.sizes, torch.zeros_like(online.flat))
 
     def update(indices: NDArray, next_states: Floats) -> tuple[Floats, None]:
         drawn = replay.rows[seed, torch.from_numpy(indices[0]).to(device)]  # (S, B, …)
-        x, next_x, next_base, fixed, discount, action = drawn.split(widths, -1)
-        action = action.long()
+        x, next_x, next_base, fixed, discount, chosen = drawn.split(widths, -1)
+        action = chosen.long()
         best = (target.forward(next_x) + next_base).amax(-1, keepdim=True)  # (S, B, 1)
         y = torch.addcmul(fixed, discount, best)
         output = online.forward(x)  # (S, B, A)
         error = output.gather(-1, action) - y
         clipped = error.clamp(-1.0, 1.0)
         # ∂loss/∂output of the mean over the batch, summed over seeds
-        slope = torch.zeros_like(output)
-        slope.scatter_(-1, action, clipped / error.shape[1])
+        slope = torch.zeros_like(output).scatter_(-1, action, clipped / error.shape[1])
         online.backward(x, slope, gradient)
         deep.optimiser.step(online.flat, gradient.flat)
         return (clipped * (error - 0.5 * clipped)).mean((1, 2)).cpu().numpy(), None

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from bcrl.envs import Env, Success, is_finite, is_simulated, lanes_of
 from bcrl.envs.base import FiniteEnv
 from bcrl.learning import Booleans, Floats, Integers
-from bcrl.learning.policies import greedy, uniform, walk
+from bcrl.learning.policies import greedy, walk
 from bcrl.q.functions import NOT_FINITE, Q, Table, query, rows_of
 
-AT_ONCE = 128  # simulators that exist at a time in `play`,
-EPISODES = 32  # at most this many of them for one seed
+AT_ONCE = (4, 32)  # seeds, and episodes of each, whose simulators exist at a time
 CHOICES = 3  # uniforms per decision of DQN: explore? which action? the prior's action
 
 
@@ -41,9 +40,8 @@ class Episodes:
     def solved(self, success: Success | str = "unpunished") -> Booleans:
         """Whether each episode was a success by a rule of `env.success`, (S, E)."""
         rule, threshold = Success(success) if isinstance(success, str) else success
-        last = np.maximum(self.length - 1, 0)[..., None]
-        ended = np.take_along_axis(self.absorbing, last, -1)[..., 0]
-        reward = np.take_along_axis(self.reward, last, -1)[..., 0]
+        last = (*np.indices(self.length.shape), np.maximum(self.length - 1, 0))
+        ended, reward = self.absorbing[last], self.reward[last]
         outcomes: dict[str, Any] = {
             "absorbed": ended,
             "survived": ~ended,
@@ -92,7 +90,7 @@ def rollout(env: Env, q: Q, start: Floats, u: Floats, epsilon: float = 0.0) -> E
     failed: dict[int, str] = {}
 
     def epsilon_greedy(states: NDArray, u: NDArray, alive: NDArray) -> NDArray:
-        action = uniform(env.n_actions, u[..., 1])
+        action = (u[..., 1] * env.n_actions).astype(np.intp)
         exploit = alive & (u[..., 0] >= epsilon)
         if exploit.any():  # Q may be expensive: query it only where it decides
             queried = [x[lanes] for x, lanes in zip(states, exploit, strict=True)]
@@ -115,13 +113,10 @@ def play(env: Env, policy: Policy, start: Floats, u: Floats) -> Episodes:
     length, reported = np.zeros(shape[1:], np.intp), None
     failed: dict[int, str] = {}
     # Few simulators run at the same time; the policy always sees the states of all.
-    seeds, at_once = n_seeds, n_episodes
-    if is_simulated(env):
-        at_once = min(EPISODES, AT_ONCE)
-        seeds = AT_ONCE // at_once
-    parts = itertools.product(range(0, n_seeds, seeds), range(0, n_episodes, at_once))
+    seeds, each = AT_ONCE if is_simulated(env) else (n_seeds, n_episodes)
+    parts = itertools.product(range(0, n_seeds, seeds), range(0, n_episodes, each))
     for s, e in parts:
-        part = (slice(s, s + seeds), slice(e, e + at_once))
+        part = (slice(s, s + seeds), slice(e, e + each))
         lanes = lanes_of(env)
         state[0][part] = lanes.begin(start[part])
         alive = np.zeros(shape[1:], bool)
@@ -147,9 +142,8 @@ def play(env: Env, policy: Policy, start: Floats, u: Floats) -> Episodes:
             reported = np.zeros(shape[1:], bool) if reported is None else reported
             reported[part] = succeeded
         lanes.close()
-        width_of_part = start[part].shape[1]
-        failures = lanes.failures.items()
-        failed = {s + lane // width_of_part: why for lane, why in failures} | failed
+        lost, n = lanes.failures.items(), start[part].shape[1]
+        failed = {s + lane // n: why for lane, why in lost} | failed
     state, action, reward, absorbing = (
         # Contiguous, because sums over strided axes depend on the number of lanes.
         np.ascontiguousarray(np.moveaxis(part, 0, 2))

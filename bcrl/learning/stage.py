@@ -1,7 +1,5 @@
 """A stage is a task, a learner with its budget, and the transfers into it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol
@@ -35,11 +33,11 @@ class Learner(Protocol):
         """Iterations or environment steps of a stage."""
 
     def learn(
-        self, stage: Stage, start: StageInit, batch: SeedBatch, state: Any = None
-    ) -> Iterator[Pause]:
+        self, stage: "Stage", start: StageInit, batch: SeedBatch, state: Any = None
+    ) -> Iterator["Pause"]:
         """Learn `stage` from `start`; yields pauses, the last one a `Snapshot`.
 
-        With the `state` of a pause it resumes there, as if never interrupted.
+        With the `state` of a pause it resumes there.
         """
 
 
@@ -90,10 +88,7 @@ class StepSnapshot(Snapshot):
 @storable
 @dataclass(frozen=True)
 class RunState:
-    """A run's state: stages completed, the last one's result, the next one's state.
-
-    The state is not a copy: store it before learning continues.
-    """
+    """Stages completed, the last one's result, and the learner's state in the next."""
 
     stages: int
     result: StageResult | None
@@ -110,17 +105,16 @@ class CurriculumRun:
 
     def __iter__(self) -> Iterator[Pause]:
         for stage in self.stages[self.state.stages :]:
-            now, done = self.state, False
+            now, learner = self.state, stage.learner
             start = begin(stage.transfers, now.result)
-            for pause in stage.learner.learn(stage, start, self.batch, now.state):
+            for pause in learner.learn(stage, start, self.batch, now.state):
                 if isinstance(pause, Snapshot) and pause.last_of_stage:
-                    now, done = RunState(stage.number, pause.result), True
+                    self.state = RunState(stage.number, pause.result)
                 else:
-                    now, done = RunState(now.stages, now.result, pause.state), False
-                self.state = now
+                    self.state = RunState(now.stages, now.result, pause.state)
                 yield pause
-            if not done:
-                name = getattr(stage.learner, "name", type(stage.learner).__name__)
+            if self.state.stages < stage.number:
+                name = getattr(learner, "name", type(learner).__name__)
                 why = "must end with a Snapshot whose last_of_stage is true"
                 raise BcrlError(f"{name}.learn: stage {stage.number} {why}")
 

@@ -1,7 +1,7 @@
 """Transfers: how the result of one stage enters the next.
 
-A transfer edits the next stage's `StageInit`. Several can be combined: `Boost` and
-`Shape` make SBC-DQN. Learners read only the `StageInit`.
+A transfer edits the next stage's `StageInit`, which is all that learners read. Several
+can be combined: `Boost` and `Shape` make SBC-DQN.
 """
 
 from __future__ import annotations
@@ -61,10 +61,9 @@ class Shape:
 
 @dataclass(frozen=True)
 class PolicyReuse:
-    """In step t the previous greedy policy acts with probability ν^t (PPR).
+    """In step t the previous greedy policy acts with probability ν^t, 0 ≤ ν ≤ 1 (PPR).
 
-    Raises ConfigError for ν outside [0, 1]. Source: Fernández and Veloso (2006), in the
-    version of Brys et al. (2015).
+    Source: Fernández and Veloso (2006), in the version of Brys et al. (2015).
     """
 
     nu: float = 0.998
@@ -81,8 +80,8 @@ class PolicyReuse:
 class ResidualPolicy:
     """The executed action is the one nearest to the prior's + the own action (RPL).
 
-    In the first `offset` greedy decisions the own action copies the prior's. Raises
-    ConfigError for a negative offset. Source: Silver et al. (2018).
+    In the first `offset` ≥ 0 greedy decisions the own action copies the prior's.
+    Source: Silver et al. (2018).
     """
 
     offset: int = 2000
@@ -129,10 +128,7 @@ def warm_start(start: StageInit, previous: StageResult) -> StageInit:
 
 
 def begin(transfers: Sequence[Transfer], previous: StageResult | None) -> StageInit:
-    """The start of a stage, by all transfers in order; a first stage has none.
-
-    Raises ConfigError for a transfer that does not return a `StageInit`.
-    """
+    """The start of a stage, by all transfers in order; a first stage has none."""
     start = StageInit(previous)
     if previous is None:
         return start

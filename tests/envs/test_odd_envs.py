@@ -123,7 +123,7 @@ def test_few_simulators_exist_at_a_time_and_the_numbers_are_the_same(monkeypatch
     whole = rollout(task, q, start, u, epsilon=0.3)
     assert max(most) == 22
     most.clear()
-    monkeypatch.setattr("bcrl.learning.rollout.AT_ONCE", 8)
+    monkeypatch.setattr("bcrl.learning.rollout.AT_ONCE", (1, 8))
     parts = rollout(task, q, start, u, epsilon=0.3)
     assert max(most) == 8 and held() == 0
     np.testing.assert_equal(vars(whole), vars(parts))

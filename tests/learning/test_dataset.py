@@ -23,27 +23,22 @@ def test_the_dataset_is_the_episodes_with_repetitions_counted(env):
         )
 
     kept = np.arange(env.horizon) < played.length[0][:, None]
-    expected = rows(
-        played.state[0, :, :-1][kept],
-        played.action[0][kept],
-        played.reward[0][kept],
-        played.state[0, :, 1:][kept],
-        played.absorbing[0][kept],
-    )
+    state, outcomes = played.state[0], (played.action, played.reward, played.absorbing)
+    seen = (state[:, :-1], state[:, 1:], *(x[0] for x in outcomes))
+    expected = rows(*(x[kept] for x in seen))
     again = np.repeat(np.arange(len(d.state)), d.multiplicity)
-    found = rows(
-        d.points[d.state[again]],
-        d.action[again],
-        d.reward[again],
-        d.points[d.next_state[again]],
-        d.absorbing[again],
+    stored = (
+        d.points[d.state],
+        d.points[d.next_state],
+        d.action,
+        d.reward,
+        d.absorbing,
     )
-    assert found == expected
+    assert rows(*(x[again] for x in stored)) == expected
     if env.finite:
         assert len(d.state) <= 10 < len(expected)  # the corridor repeats itself
     assert np.array_equal(d.points[d.probe], probe)
-    for a, part in enumerate(d.by_action):
-        assert (d.action[part.rows] == a).all()
-        asked = set(part.x.ravel().tolist()) | set(part.queries.ravel().tolist())
-        assert asked == set(d.points.ravel().tolist())
-        assert not set(part.x.ravel().tolist()) & set(part.queries.ravel().tolist())
+    for a, (own, others) in enumerate(d.by_action):
+        assert own.tolist() == np.flatnonzero(d.action == a).tolist()
+        asked = [*set(d.state[own].tolist()), *others.tolist()]
+        assert sorted(asked) == list(range(len(d.points)))

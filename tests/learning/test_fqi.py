@@ -6,35 +6,27 @@ import numpy as np
 import pytest
 
 from bcrl.evaluation.oracle.maze import optimal_q
+from bcrl.learning import stage
 from bcrl.learning.fqi import FQI
 from bcrl.learning.rollout import transition_tables
 from bcrl.learning.stage import SeedBatch, Stage
-from bcrl.learning.stage import learn as learn_stages
 from bcrl.learning.transfer import Boost, Shape, begin, warm_start
 from bcrl.q.functions import ZERO, Sum, Table, Zero, add
 from bcrl.q.regressors.ours import ForestRegressor, Tabular
 from tests.toys import Corridor, OpenCorridor
 
 
-def stages(
-    tasks,
-    transfers=(warm_start,),
-    regressor=None,
-    iterations=120,
-    new_data=(True, True),
-    **options,
-):
-    made = []
+def stages(tasks, transfers=(warm_start,), iterations=120, keep_data=False, **options):
+    made, options = [], {"regressor": Tabular()} | options
     for i, env in enumerate(tasks):
-        fits = {"regressor": regressor or Tabular(), "new_data": new_data[i]} | options
-        learner = FQI(iterations, 60, **fits)
+        learner = FQI(iterations, 60, new_data=not (i and keep_data), **options)
         made.append(Stage(i + 1, i + 1, env, learner, transfers, i * iterations))
     return made
 
 
 def learn(tasks, *transfers, seeds=(0, 1), **options):
     batch = SeedBatch(seeds, Corridor().states())
-    return list(learn_stages(stages(tasks, transfers, **options), batch))
+    return list(stage.learn(stages(tasks, transfers, **options), batch))
 
 
 @pytest.mark.parametrize(
@@ -66,16 +58,13 @@ def test_tabulated_and_general_evaluation_agree_with_the_same_forests(transfers)
 
 
 def test_an_action_never_tried_keeps_its_approximator():
-    tasks, batch = (
-        [Corridor(), Corridor(prize=5.0)],
-        SeedBatch((0,), Corridor().states()),
-    )
-    first, second = stages(tasks, iterations=3, new_data=(True, False))
-    *_, before = learn_stages([first], batch)
+    tasks, probe = [Corridor(), Corridor(prize=5.0)], Corridor().states()
+    batch = SeedBatch((0,), probe)
+    first, second = stages(tasks, iterations=3, keep_data=True)
+    *_, before = stage.learn([first], batch)
     (data,) = before.result.data
-    left, right = data.by_action
-    starved = replace(left, rows=np.empty(0, np.intp))
-    data = [replace(data, by_action=(starved, right))]
+    (_, left), right = data.by_action
+    data = [replace(data, by_action=[(np.empty(0, np.intp), left), right])]
     start = begin([warm_start], replace(before.result, data=data))
     *_, after = second.learner.learn(second, start, batch)
     assert np.array_equal(after.probed_q[0][:, 0], before.probed_q[0][:, 0])
@@ -83,7 +72,7 @@ def test_an_action_never_tried_keeps_its_approximator():
 
 
 def test_a_kept_dataset_is_not_collected_again():
-    options = {"iterations": 2, "new_data": (True, False), "seeds": (0,)}
+    options = {"iterations": 2, "keep_data": True, "seeds": (0,)}
     snapshots = learn([Corridor()] * 2, warm_start, **options)
     assert snapshots[0].result.data is snapshots[-1].result.data
     assert [x.count for x in snapshots] == [1, 2, 3, 4]

@@ -51,8 +51,6 @@ def test_the_last_gain_is_riccatis_within_a_hundredth():
     off = gains(final, 10) - best
     # Worst entry, relative to the largest: half of the optimal entries are zero.
     assert np.abs(off).max() / np.abs(best).max() < 0.01
-    own = np.abs(best) > 1.0
-    assert (np.abs(off[:, own]) / np.abs(best[own])).max() < 0.01
     assert final.failed == {}
 
 
@@ -112,18 +110,6 @@ def test_lstdq_solves_its_equations_by_the_pseudo_inverse_if_need_be(kind, n, id
     assert np.allclose(found, shortest, rtol=1e-5, atol=1e-6)
 
 
-def good_matrix():
-    """A Q whose force i is −2 position − 1 velocity."""
-    matrix = -np.eye(6)
-    for i in range(2):
-        matrix[4 + i, 2 * i], matrix[4 + i, 2 * i + 1] = -2.0, -1.0
-    return matrix
-
-
-def test_the_improved_gain_by_hand():
-    assert improved(good_matrix(), LQ).tolist() == [[-2, -1, 0, 0], [0, 0, -2, -1]]
-
-
 @pytest.mark.parametrize(
     ("where", "value"),
     [
@@ -135,7 +121,9 @@ def test_the_improved_gain_by_hand():
     ],
 )
 def test_a_gain_that_pushes_away_or_is_not_finite_is_rejected(where, value):
-    matrix = good_matrix()
+    matrix = -np.eye(6)  # of a Q whose force i is −2 position − 1 velocity
+    matrix[[4, 4, 5, 5], range(4)] = [-2.0, -1.0, -2.0, -1.0]
+    assert improved(matrix, LQ).tolist() == [[-2, -1, 0, 0], [0, 0, -2, -1]]
     matrix[where] = value
     assert improved(matrix, LQ) is None
 
@@ -170,9 +158,10 @@ def test_what_an_iteration_collects(drop):
     k = np.stack([riccati_gain(LQ) / 3, riccati_gain(LQ) / 2])
     z, after, reward = learner._collect(staged(learner, LQ), k, 1, team(5, 6))
     assert z.shape == after.shape == (2, n, 6) and reward.shape == (2, n)
-    noise = z[..., 4:] - np.einsum("skd,snd->snk", k, z[..., :4])
+    force, next_force = (np.einsum("skd,snd->snk", k, x[..., :4]) for x in (z, after))
+    noise = z[..., 4:] - force
     assert noise.std() == pytest.approx(0.1, rel=0.05) and abs(noise.mean()) < 0.01
-    assert np.allclose(after[..., 4:], np.einsum("skd,snd->snk", k, after[..., :4]))
+    assert np.allclose(after[..., 4:], next_force)
     state_cost = ([3, 1, 3, 1] * after[..., :4] ** 2).sum(-1)
     cost = state_cost + 0.1 * (z[..., 4:] ** 2).sum(-1)
     assert np.allclose(reward, -cost, rtol=1e-12)
@@ -181,14 +170,6 @@ def test_what_an_iteration_collects(drop):
     assert (np.abs(state[:, :, 0] - [-4, 0, 0, 0]) <= 0.3).all()
     again = learner._collect(staged(learner, LQ), k, 2, team(5, 6))[0]
     assert not np.array_equal(z[:, 0], again[:, 0])  # its own data, every iteration
-
-
-def test_a_seed_alone_is_the_same_among_others():
-    for one, among in zip(iterations((3,)), iterations(range(5)), strict=True):
-        assert np.array_equal(gains(one, 1)[0], gains(among, 5)[3])
-        at = np.random.default_rng(0).standard_normal((5, 1, 4))
-        values = one.result.q(at[3:4], 8), among.result.q(at, 8)
-        assert np.array_equal(values[0][0], values[1][3])
 
 
 def test_steps_that_are_not_whole_episodes_are_rejected():

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from bcrl.common.seeding import stream
-from bcrl.envs.maze import Maze
-from bcrl.learning.policies import epsilon_greedy, greedy, uniform
+from bcrl.learning.policies import epsilon_greedy, greedy
 from bcrl.learning.rollout import draws, rollout, starts_and_draws
 from bcrl.q.functions import Table
 from tests.toys import Corridor, OpenCorridor
@@ -26,15 +25,6 @@ def test_the_tabular_walk_equals_the_general_rollout(epsilon):
         assert np.array_equal(getattr(fast, name), getattr(plain, name)), name
     live = np.arange(env.horizon) < fast.length[..., None]
     assert np.array_equal(fast.action[live], plain.action[live])
-
-
-def test_a_seed_plays_alone_as_it_does_among_others():
-    env = Maze(0.05)
-    rng = np.random.default_rng(2)
-    values = [rng.random((441, 4)) for _ in range(3)]
-    together = play(env, Table(values, env), 0.2, seeds=(0, 1, 2))
-    alone = play(env, Table(values[2:], env), 0.2, seeds=(2,))
-    assert np.array_equal(together.state[2], alone.state[0])
 
 
 def test_epsilon_one_never_asks_for_values():
@@ -74,8 +64,8 @@ def test_greedy_takes_the_maximum_and_breaks_ties_uniformly():
 
 def test_random_actions_are_all_and_only_actions():
     u = np.array([[0.0, 0.2499, 0.25, 0.75, np.nextafter(1, 0)]])
-    assert uniform(4, u).tolist() == [[0, 0, 1, 3, 3]]
     q = np.tile([0.0, 0.0, 1.0, 0.0], (1, 5, 1))
     epsilon = np.array([0.6, 0.6, 0.6, 0.5, 0.0])
     found = epsilon_greedy(q, np.full((1, 5), 0.5), u, epsilon)
     assert found.tolist() == [[0, 0, 1, 2, 2]]
+    assert epsilon_greedy(q, u, u, 1.0).tolist() == [[0, 0, 1, 3, 3]]

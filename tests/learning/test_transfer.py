@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from bcrl.api import Boost, PolicyReuse, ResidualPolicy, Shape, warm_start
 from bcrl.common.seeding import stream
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.errors import ConfigError
@@ -15,16 +16,7 @@ from bcrl.learning.bellman import precompute_target, residual_target, shaping
 from bcrl.learning.dqn import CHOICES, DQN, DRAW_BLOCK, DQNTrainer
 from bcrl.learning.policies import combined_actions
 from bcrl.learning.rollout import transition_tables
-from bcrl.learning.transfer import (
-    Boost,
-    PolicyReuse,
-    ResidualPolicy,
-    Shape,
-    StageInit,
-    StageResult,
-    begin,
-    warm_start,
-)
+from bcrl.learning.transfer import StageInit, StageResult, begin
 from bcrl.q.functions import ZERO, Shaped, Sum, Table
 from tests.toys import Corridor, last, staged, team
 
@@ -42,9 +34,8 @@ BASE = np.array([0.5, 0.25, -2.0])
 
 
 def target(base, next_base, boost):
-    inside, fixed, discount = precompute_target(
-        REWARD, ABSORBING, next_base, base, 0.9, boost
-    )
+    known = (REWARD, ABSORBING, next_base, base, 0.9, boost)
+    inside, fixed, discount = precompute_target(*known)
     return fixed + discount * (NEXT_RESIDUAL + inside).max(-1)
 
 
@@ -67,13 +58,6 @@ def test_the_target_of_each_boost_by_hand(boost, expected):
         whole = NEXT_BASE + NEXT_RESIDUAL
         equation_5 = residual_target(REWARD, ABSORBING, whole, BASE, 0.9)
         assert np.allclose(target(BASE, NEXT_BASE, boost), equation_5)
-
-
-def test_the_shaping_term_by_hand():
-    value, after = np.array([4.0, 4.0]), np.array([6.0, 6.0])
-    done = np.array([False, True])
-    assert shaping(value, after, done, 0.5, True).tolist() == [-1.0, -4.0]
-    assert shaping(value, after, done, 0.5, False).tolist() == [-1.0, -1.0]
 
 
 class Known:
@@ -168,9 +152,6 @@ def test_the_horizons_end_is_bootstrapped_from_and_starts_anew():
     assert np.allclose(stored(run, 3)["state"], fresh, atol=1e-6)
 
 
-# --- residual policy and policy reuse ---
-
-
 def by_brute_force(actions, prior, own):
     x, y = (a + b for a, b in zip(actions[prior], actions[own], strict=True))
     if math.hypot(x, y) < 1e-6:
@@ -198,11 +179,9 @@ def test_the_prior_acts_with_probability_nu_to_the_step(step, nu, epsilon):
     run = run_of(StageInit(prior=Known(5), behavior=PolicyReuse(nu)))
     run.state.step, n = step, 4000
     u = np.random.default_rng(step).random((1, n, 3))
-    residual, prior = (
-        np.broadcast_to(-np.abs(np.arange(8.0) - best), (1, n, 8)) for best in (2, 5)
-    )
-    frozen = (np.zeros((1, n, 8)), None, prior)
-    own, done = run._choose(residual, frozen, u, epsilon)
+    states = np.zeros((1, n, 4))
+    frozen = (np.zeros((1, n, 8)), None, Known(5)(states, 8))
+    own, done = run._choose(Known(2)(states, 8), frozen, u, epsilon)
     random, follow = u[0, :, 0] < epsilon, u[0, :, 2] < nu**step
     free = np.where(random, np.floor(8 * u[0, :, 1]), 2)
     assert np.array_equal(done[0], np.where(follow, 5, free))
@@ -273,27 +252,19 @@ def test_evaluation_of_policy_reuse_explores_with_the_prior_and_is_greedy_withou
     assert (done[HALF:] == best).all() and best != 4
 
 
-# --- what a stage starts from ---
-
-
 def test_each_transfer_edits_its_own_part_of_the_start():
     q, own = Known(1), Known(2)
-    previous, reuse = StageResult(q, own), PolicyReuse(0.5)
+    start, reuse = StageInit(StageResult(q, own)), PolicyReuse(0.5)
+    boosted = {"base": q, "boost": RELEASED_BOOST}
+    shaped = {"potential": q, "shape": RELEASED_SHAPE}
     assert begin((RELEASED_BOOST,), None) == StageInit()  # a first stage
     for transfers, edited in (
         ((), {}),
         ((reuse,), {"prior": q, "behavior": reuse}),
         ((warm_start,), {"initial": own}),
-        (
-            (RELEASED_BOOST, RELEASED_SHAPE),
-            {
-                **{"base": q, "boost": RELEASED_BOOST},
-                **{"potential": q, "shape": RELEASED_SHAPE},
-            },
-        ),
+        ((RELEASED_BOOST, RELEASED_SHAPE), boosted | shaped),
     ):
-        expected = replace(StageInit(previous), **edited)
-        assert begin(transfers, previous) == expected
+        assert begin(transfers, start.previous) == replace(start, **edited)
 
 
 @pytest.mark.parametrize(
@@ -320,9 +291,11 @@ def test_a_warm_start_continues_with_all_but_the_replay():
     assert not torch.equal(old.online.flat, old.target.flat)
     run = run_of(begin([warm_start], result), settings, seeds=(0, 1))
     deep, replay = run.state.deep, run.state.replay
-    assert torch.equal(deep.online.flat, old.online.flat)
-    assert torch.equal(deep.target.flat, old.target.flat)
-    assert torch.equal(deep.optimiser.moments, old.optimiser.moments)
+
+    def trained_parts(of):
+        return torch.stack([of.online.flat, of.target.flat, *of.optimiser.moments])
+
+    assert torch.equal(trained_parts(deep), trained_parts(old))
     assert (deep.steps, deep.optimiser.steps) == (90, 70) and replay.size == 0
     for step in range(25):  # step 100 copies the target, after 10 here
         run.act()
@@ -331,8 +304,7 @@ def test_a_warm_start_continues_with_all_but_the_replay():
         run.end_step()
         assert torch.equal(deep.target.flat, old.online.flat) == (step >= 9)
     assert not torch.equal(deep.online.flat, old.online.flat)
-    assert torch.equal(result.residual.online.flat, old.online.flat)  # untouched
-    assert torch.equal(result.residual.optimiser.moments, old.optimiser.moments)
+    assert torch.equal(trained_parts(result.residual), trained_parts(old))  # untouched
 
 
 def test_a_boosted_stage_starts_with_new_networks_on_a_frozen_sum():
@@ -344,9 +316,6 @@ def test_a_boosted_stage_starts_with_new_networks_on_a_frozen_sum():
     assert (deep.steps, deep.optimiser.steps) == (0, 0)
     q = run.snapshot().result.q
     assert isinstance(q, Sum) and q.terms == (first.q, deep)
-
-
-# --- shaping's invariance (Ng et al. 1999) ---
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -361,9 +330,6 @@ def test_shaping_shifts_q_by_minus_v_and_keeps_the_greedy_policy(seed):
     assert np.array_equal(shaped.argmax(1), plain.argmax(1))
     tables = (Table([t], env) for t in (shaped, np.repeat(v[:, None], 2, 1)))
     assert np.allclose(Shaped(ZERO, *tables)([env.states()], 2)[0], plain, atol=1e-9)
-
-
-# --- queries of frozen Q-functions ---
 
 
 class Counting:

@@ -35,10 +35,10 @@ def signed_steps(env: CarOnHill) -> NDArray[np.int64]:
     BcrlError for a mass that takes too long, as one that stays in the valley forever.
     Source: Klink et al. (2022), C.1; Ernst, Geurts & Wehenkel (2005).
     """
-    states, bound = env.evaluation_states(), least_steps(env.mass, CELLS)
+    states, bound = env.evaluation_states(), least_steps(env.mass)
     start, pair, reward, absorbing = _branch(env, states, np.arange(len(states)))
     steps = reward.astype(np.int64)  # ±1 where the first step decides
-    limit = bound[_cells(start, CELLS)]
+    limit = bound[_cells(start)]
     pair = np.flatnonzero(~absorbing)
     # Iterative deepening from the bound: the first limit that suffices is least.
     while pair.size:
@@ -67,7 +67,7 @@ def _drive(
         arrived[pair[reward > 0.0]] = True
         going = ~(absorbing | arrived[pair])
         state, pair = state[going], pair[going]
-        least = bound[_cells(state, CELLS)]
+        least = bound[_cells(state)]
         late = depth + least > limit[pair]
         cut[pair[late & np.isfinite(least)]] = True
         state, pair = state[~late], pair[~late]
@@ -79,25 +79,20 @@ def _branch(
 ) -> tuple[Floats, Integers, Floats, Booleans]:
     """Next states by both actions, the pairs they belong to, reward, absorbing."""
     if pair.size > _LARGEST:
-        why = "the search for Q* takes too long; choose a mass near 1 kg"
-        why += ", or leave q_error out of env.metrics"
+        why = "Q* takes too long to find; choose a mass near 1 kg, or no metric q_error"
         raise BcrlError(f"env.mass={env.mass}: {why}")
     after, reward, absorbing = env.step(state[:, None], np.arange(env.n_actions))
     pairs = np.repeat(pair, env.n_actions)
     return after.reshape(-1, env.state_dim), pairs, reward.ravel(), absorbing.ravel()
 
 
-def least_steps(mass: float, cells: int) -> Floats:
-    """At least so many steps lead from each of cells × cells cells to the goal.
-
-    Position-major; infinite where the goal is out of reach.
-    """
-    low, high = image_boxes(mass, cells)
+def least_steps(mass: float) -> Floats:
+    """At least so many steps lead from each cell to the goal; infinite if none do."""
+    low, high = image_boxes(mass)
     slow = (high[..., 1] >= -MAX_SPEED) & (low[..., 1] <= MAX_SPEED)
     goal = slow & (high[..., 0] > MAX_POSITION)
     alive = slow & (high[..., 0] >= -MAX_POSITION) & (low[..., 0] <= MAX_POSITION)
-    (top, left), (bottom, right) = _cells(low, cells), _cells(high, cells)
-    bottom, right = bottom + 1, right + 1
+    (top, left), (bottom, right) = _cells(low), (i + 1 for i in _cells(high))
     # A cell is one step further from the goal than the nearest cell it may reach.
     bound, steps = np.where(goal.any(0), 1.0, np.inf), 1
     while (bound == steps).any():
@@ -109,42 +104,34 @@ def least_steps(mass: float, cells: int) -> Floats:
     return bound
 
 
-def image_boxes(mass: float, cells: int) -> tuple[Floats, Floats]:
-    """Lower and upper corners of boxes around each cell's image, (2, cells, cells, 2).
-
-    The leading axis is the action.
-    """
-    axes = [np.linspace(-limit, limit, cells + 1) for limit in _LIMITS]
+def image_boxes(mass: float) -> tuple[Floats, Floats]:
+    """Corners of boxes around each cell's image by action, (2, CELLS, CELLS, 2)."""
+    axes = [np.linspace(-limit, limit, CELLS + 1) for limit in _LIMITS]
     corners = np.stack(np.meshgrid(*axes, indexing="ij"), -1)[:, :, None]
     image, _, _ = CarOnHill(mass=mass).step(corners, np.arange(2))
     image = np.moveaxis(image, 2, 0)
     four = image[:, :-1, :-1], image[:, 1:, :-1], image[:, :-1, 1:], image[:, 1:, 1:]
-    margin = _MARGIN * 2.0 * _LIMITS / cells
+    margin = _MARGIN * 2.0 * _LIMITS / CELLS
     return np.minimum.reduce(four) - margin, np.maximum.reduce(four) + margin
 
 
-def _cells(state: Floats, cells: int) -> tuple[Integers, ...]:
+def _cells(state: Floats) -> tuple[Integers, ...]:
     """Rows and columns of the cells of, or nearest to, states (..., 2)."""
-    scaled = np.nan_to_num((state / _LIMITS + 1.0) * (cells / 2))
-    return tuple(np.moveaxis(np.clip(scaled, 0, cells - 1).astype(np.intp), -1, 0))
-
-
-def values(steps: NDArray[np.int64], gamma: float) -> Floats:
-    """Q* = sign(k) γ^(|k| − 1) of signed steps k."""
-    return np.sign(steps) * gamma ** (abs(steps) - 1)
+    scaled = np.nan_to_num((state / _LIMITS + 1.0) * (CELLS / 2))
+    return tuple(np.moveaxis(np.clip(scaled, 0, CELLS - 1).astype(np.intp), -1, 0))
 
 
 def reference(env: CarOnHill) -> tuple[Floats, Floats]:
-    """The grid of evaluation states (n, 2), and Q* (n, 2) there."""
-    return env.evaluation_states(), values(signed_steps(env), env.gamma)
+    """The grid of evaluation states (n, 2), and Q* = sign(k) γ^(|k| − 1) (n, 2)."""
+    steps = signed_steps(env)
+    return env.evaluation_states(), np.sign(steps) * env.gamma ** (abs(steps) - 1)
 
 
 def table(env: CarOnHill) -> Iterator[str]:
     """CSV lines, actions (as forces) outermost, then the grid position-major."""
     yield "position,velocity,action,signed_steps,q"
-    steps = signed_steps(env)
-    q = values(steps, env.gamma)
-    for action, force in enumerate((-FORCE, FORCE)):
-        for row, (p, v) in enumerate(env.evaluation_states()):
-            k = steps[row, action]
-            yield f"{p:.17g},{v:.17g},{force:g},{k},{q[row, action]:.17g}"
+    states, values = reference(env)
+    actions = zip((-FORCE, FORCE), signed_steps(env).T, values.T, strict=True)
+    for force, steps, qs in actions:
+        for (p, v), k, q in zip(states, steps, qs, strict=True):
+            yield f"{p:.17g},{v:.17g},{force:g},{k},{q:.17g}"
