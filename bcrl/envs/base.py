@@ -28,6 +28,21 @@ class Success(NamedTuple):
     threshold: float = 0.0
 
 
+def default_success(
+    reports: bool, low: float, high: float, threshold: float | None
+) -> str:
+    """The rule of `env.success` that suits the rewards of random play.
+
+    `reports`: info has a success key. `low`, `high`: least and largest reward of the
+    steps that did not terminate. `threshold`: the registered `reward_threshold`.
+    """
+    if reports:
+        return "info"
+    if low < high and threshold is not None:
+        return "rewarded" if high < 0 < threshold else "threshold"
+    return "absorbed" if high < 0 else "survived" if low > 0 else "rewarded"
+
+
 class Env(Protocol):
     """One task, as a frozen dataclass whose fields are its constants.
 

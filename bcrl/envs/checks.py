@@ -5,6 +5,7 @@ user's pure environment. `gymnasium.py` has the trial of a simulator.
 """
 
 import functools
+import reprlib
 import sys
 import traceback
 from collections.abc import Hashable, Sequence
@@ -45,6 +46,13 @@ def described(error: BaseException) -> str:
     first_line = str(error).strip().partition("\n")[0][:200]
     place = f"…/{Path(frame.filename).name}:{frame.lineno}"
     return f"{type(error).__name__}: {first_line} ({place})"
+
+
+def shown(value: Any) -> str:
+    """A wrong value in a message, on one short line, with its type."""
+    if isinstance(value, np.ndarray) and value.ndim:
+        return f"an array of shape {value.shape} and type {value.dtype}"
+    return f"{' '.join(reprlib.repr(value).split())} of type {type(value).__name__}"
 
 
 def unresolved(seen: Floats) -> str:

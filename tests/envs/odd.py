@@ -234,7 +234,7 @@ REJECTED = {
     ),
     "NoReset": ("reset … OSError: no … odd.py:", first(lambda _: fail(OSError("no")))),
     "Leaves": ("step … SystemExit: bye … odd.py:", give(lambda *_: sys.exit("bye"))),
-    "NoSpace": ("observation_space … None … gymnasium", {"observation_space": None}),
+    "NoSpace": ("observations None … gymnasium", {"observation_space": None}),
     "Words": (
         "observations … Text … filter_keys: [at]",
         see(words, Dict(at=box(1), goal=Text(9))),

@@ -12,8 +12,8 @@ from torch.nn import functional
 from bcrl.api import DQN, FQI, Boost, Forest, Gymnasium, run, stages
 from bcrl.common import serialization
 from bcrl.common.seeding import stream
+from bcrl.envs.base import default_success
 from bcrl.envs.checks import unresolved
-from bcrl.envs.gymnasium import default_success
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.evaluation.step_metrics import evaluate
 from bcrl.learning.rollout import play, starts_and_draws, success_of
