@@ -58,7 +58,7 @@ class Recipe:
     def make(self, render_mode: str | None = None) -> gymnasium.Env:
         """A new environment without a time limit; ConfigError for a wrong key."""
         spec = spec_of(self.id)
-        # A copy for each simulator: one that changes a list changes no other's.
+        # Each simulator has its own lists, which it may change.
         kwargs, attributes = copy.deepcopy((self.kwargs or {}, self.attributes or {}))
         point = spec.entry_point
         creator = load_env_creator(point) if isinstance(point, str) else point
@@ -173,5 +173,4 @@ def _wrapped(env: gymnasium.Env, wrapper: Any) -> gymnasium.Env:
     try:
         return cls(env, **given)
     except Exception as error:  # of a wrapper's code
-        why = f"the wrapper failed: {type(error).__name__}: {error}"
-        raise ConfigError(place, given, why) from error
+        raise ConfigError(place, given, f"{type(error).__name__}: {error}") from error

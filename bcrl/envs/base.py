@@ -14,8 +14,7 @@ from bcrl.errors import ConfigError
 Floats = NDArray[np.float64]
 Ints = NDArray[np.integer]
 Bools = NDArray[np.bool_]
-#: Next state (..., d), reward (...), absorbing (...).
-Step = tuple[Floats, Floats, Bools]
+Step = tuple[Floats, Floats, Bools]  # next state (..., d), reward, absorbing (...)
 
 #: Rules by which an episode counts as solved: docs/reference/gymnasium.md.
 RULES = ("absorbed", "survived", "unpunished", "rewarded", "threshold", "info")
@@ -59,8 +58,7 @@ class Env(Protocol):
     gamma: float  # discount factor
     horizon: int  # steps after which an episode is cut (not absorbing)
 
-    def __hash__(self) -> int:
-        """Equal constants have equal hashes."""
+    def __hash__(self) -> int: ...
 
     def initial(self, noise: Floats) -> Floats:
         """Start states (..., d) from noise (..., initial_noise)."""
@@ -100,14 +98,11 @@ class FiniteEnv(Env, Protocol):
 @storable
 @dataclass(eq=False)
 class Lanes:
-    """Episodes of one environment side by side, one per lane; any leading axes.
-
-    These are lanes of a pure environment, whose states the caller keeps.
-    """
+    """Episodes of a pure environment side by side, one per lane; any leading axes."""
 
     env: Any
     #: Why a lane's simulator failed, by the lane's number in C order. Such a lane gives
-    #: zeros and is cut at every step; other lanes are not affected.
+    #: zeros and is cut at every step.
     failures: dict[int, str] = field(default_factory=dict)
 
     def begin(self, start: Floats) -> Floats:
@@ -133,10 +128,9 @@ class Lanes:
 
 
 class SimulatedEnv(Env, Protocol):
-    """An environment with a hidden state, which only runs whole episodes.
+    """An environment with a hidden state: `initial` gives the numbers that reset lanes.
 
-    `initial` gives the numbers that reset a lane, each `state` is an observation. The
-    simulator draws its own noise, seeded by the reset.
+    Each `state` is an observation. The reset seeds all randomness.
     """
 
     starts: int  # random resets from which FQI's greedy policy is evaluated

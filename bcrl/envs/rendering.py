@@ -9,23 +9,23 @@ from PIL import Image, ImageDraw, ImageFont
 
 from bcrl.envs import Env
 from bcrl.envs.base import Floats
-from bcrl.envs.maze import GOAL_RADIUS
+from bcrl.envs.car_on_hill import CarOnHill
+from bcrl.envs.linear_system import LinearSystem
+from bcrl.envs.maze import GOAL_RADIUS, Maze
 
 _SIZE = 400  # pixels of a picture's sides
 FINER = 2  # the drawing has so many times the pixels, for smooth edges
 FONT = ImageFont.load_default(15 * FINER)
 
 #: Okabe and Ito's colours, which colour-blind people can distinguish, and greys.
-BLUE, ORANGE, GREEN = "#0072B2", "#E69F00", "#009E73"
-VERMILION, SKY = "#D55E00", "#56B4E9"
+BLUE, ORANGE, GREEN, RED, SKY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9"
 PAPER, PALE, GREY, INK = "#FBFBF9", "#E4E4DF", "#8A8A85", "#2B2B2B"
 
 
 class Canvas:
     """A square picture of [left, left + side] × [bottom, bottom + side].
 
-    Points (n, 2) and lengths have the units of this view, y upwards; widths of lines
-    are pixels.
+    Points (n, 2) and lengths have the view's units, y upwards; widths are in pixels.
     """
 
     def __init__(self, left: float, bottom: float, side: float, ground: str) -> None:
@@ -73,21 +73,15 @@ class Canvas:
 def draw(
     env: Env, path: Floats, action: Any = None, caption: str = ""
 ) -> NDArray[np.uint8]:
-    """A picture (400, 400, 3) of an environment after the states `path` (n, d).
+    """A picture (400, 400, 3), with a caption, of an environment in states (n, d).
 
-    The last state is the present one; `action`, a number or a force (k,), is applied
-    in it. `caption` stands below the picture.
+    `action`, a number or a force (k,), is applied in the last state of `path`.
     """
     vectors = getattr(env, "actions", None)
     if action is not None and np.ndim(action) == 0 and vectors is not None:
         action = vectors[action]
-    drawings = {
-        "car_on_hill": _car_on_hill,
-        "maze": _maze,
-        "linear_system": _linear_system,
-    }
-    ours, _, name = type(env).__module__.rpartition(".")
-    drawing = drawings.get(name, _bars) if ours == __package__ else _bars
+    drawings = {CarOnHill: _car_on_hill, Maze: _maze, LinearSystem: _linear_system}
+    drawing = drawings.get(type(env), _bars)
     canvas = drawing(env, np.asarray(path, float), action)
     canvas.text(12, _SIZE - 10, caption, "ld")
     return canvas.picture()
@@ -95,7 +89,7 @@ def draw(
 
 def frames_per_second(env: Env) -> int:
     """The number of steps that an animation shows per second."""
-    return 20 if type(env).__module__ == "bcrl.envs.linear_system" else 10
+    return 20 if isinstance(env, LinearSystem) else 10
 
 
 def _height(p: Any) -> Any:
@@ -114,7 +108,7 @@ def _car_on_hill(env: Any, path: Floats, force: Any) -> Canvas:
     canvas.line([(1.0, top), (1.0, top + 0.34)], INK, 3)
     canvas.polygon([(1.0, top + 0.34), (1.0, top + 0.2), (1.19, top + 0.27)], GREEN)
     for y in np.arange(0.0, 0.6, 0.1):  # a car that crosses this line is lost
-        canvas.line([(-1.0, y), (-1.0, y + 0.05)], VERMILION, 2)
+        canvas.line([(-1.0, y), (-1.0, y + 0.05)], RED, 2)
     position, speed = path[-1]
     at = min(max(position, -1.25), 1.25)
     along = np.array([2e-3, _height(at + 1e-3) - _height(at - 1e-3)])
@@ -125,8 +119,8 @@ def _car_on_hill(env: Any, path: Floats, force: Any) -> Canvas:
     cabin = [(-0.08, 0.1), (0.06, 0.1), (0.03, 0.16), (-0.06, 0.16)]
     canvas.polygon(foot + body @ axes, BLUE)
     canvas.polygon(foot + cabin @ axes, SKY)
-    for wheel in [(-0.075, 0.04), (0.075, 0.04)]:
-        canvas.disc(foot + wheel @ axes, 0.04, INK)
+    canvas.disc(foot + (-0.075, 0.04) @ axes, 0.04, INK)
+    canvas.disc(foot + (0.075, 0.04) @ axes, 0.04, INK)
     if force is not None:
         side = np.sign(force[0])
         start = foot + (0.15 * side, 0.09) @ axes
@@ -183,18 +177,17 @@ def _linear_system(env: Any, path: Floats, force: Any) -> Canvas:
     canvas.arrow(at, 0.8 * path[-1][[1, 3]], BLUE)
     if force is not None:
         canvas.arrow(at, 0.8 * np.asarray(force), ORANGE)
-    name = f"narrow pathway, drift {env.drift:g}" if narrow else "LQ task"
-    canvas.text(12, 10, f"Linear system, {name}")
+    task = f"narrow pathway, drift {env.drift:g}" if narrow else "LQ task"
+    canvas.text(12, 10, f"Linear system, {task}")
     return canvas
 
 
 def _bars(env: Any, path: Floats, force: Any) -> Canvas:
     """The present state's components as bars, long as x / (1 + |x|)."""
     canvas = Canvas(-1.6, -1.6, 3.2, PAPER)
-    state = path[-1]
-    height = min(0.4, 2.4 / len(state))
-    top = 0.5 * height * len(state)
-    for i, value in enumerate(state):
+    height = min(0.4, 2.4 / path.shape[1])
+    top = 0.5 * height * path.shape[1]
+    for i, value in enumerate(path[-1]):
         y, thick = top - (i + 0.5) * height, 0.3 * height
         end = value / (1.0 + abs(value)) if np.isfinite(value) else 0.0
         canvas.rectangle(-1.0, y - thick, 1.0, y + thick, PALE)

@@ -221,7 +221,6 @@ class SimulatedLanes(Lanes):
         return numbers[lanes].reshape(-1).tolist()
 
     def _answer(self, lane: int, method: str, argument: float, otherwise: Any) -> Any:
-        """The answer of a lane's simulator; `otherwise` from the time it has failed."""
         if lane not in self.failures:
             try:
                 return getattr(self.simulators[lane], method)(argument)
