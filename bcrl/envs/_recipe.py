@@ -93,15 +93,14 @@ def spec_of(name: str) -> EnvSpec:
         plugins.module("env.id", name, module, PACKAGES)
     if plain in gymnasium.registry:
         return gymnasium.registry[plain]
+    similar = closest(plain, gymnasium.registry)
+    hint = f"did you mean env.id={similar}? " if similar else ""
+    why = f"isn't registered; {hint}env.id=module:Name-v0 imports the module first"
     for owner, begins in PACKAGES.items():
         missing = find_spec(owner) is None
         if missing if owner == module else plain.startswith(begins):
             install = f"pip install {owner.replace('_', '-')}, then " if missing else ""
             why = f"{install}env.id={owner}:{plain} imports the package first"
-            raise ConfigError("env.id", name, why)
-    similar = closest(plain, gymnasium.registry)
-    hint = f"did you mean env.id={similar}? " if similar else ""
-    why = f"isn't registered; {hint}env.id=module:Name-v0 imports the module first"
     raise ConfigError("env.id", name, why)
 
 
@@ -135,9 +134,8 @@ def _set_attribute(env: gymnasium.Env, key: str, value: Any) -> None:
         raise ConfigError(place, value, did_you_mean(key, known))
     before = known[key]
     old, new = np.asarray(before), np.asarray(value)
-    alike = old.dtype.kind == new.dtype.kind != "O"
-    if {old.dtype.kind, new.dtype.kind} <= set("iuf"):
-        alike = bool(np.isfinite(new).all())
+    kinds = {old.dtype.kind, new.dtype.kind}
+    alike = np.isfinite(new).all() if kinds <= {*"iuf"} else kinds in ({"b"}, {"U"})
     if not alike or old.shape != new.shape:
         raise ConfigError(place, value, f"must be like {before!r}, and finite")
     if isinstance(before, np.ndarray):

@@ -45,8 +45,8 @@ def default_success(
 class Env(Protocol):
     """One task, as a frozen dataclass whose fields are its constants.
 
-    Arrays may have any leading axes (seeds, episodes); `d` is `state_dim`, `A` is
-    `n_actions`. The caller draws the noise, uniform on [0, 1).
+    Arrays may have any leading axes (seeds, episodes); d is `state_dim`, A `n_actions`.
+    The caller draws the noise, uniform on [0, 1).
     """
 
     name: ClassVar[str]

@@ -56,8 +56,8 @@ class CarOnHill:
     def bounds(self) -> Floats:
         """The lowest and the highest states that a step can lead to, (2, 2).
 
-        |dv/dt| ≤ c + v² with c = u/m + g/2, so v grows at most like a tangent. They are
-        infinite for a car so light that the tangent is infinite within a step.
+        |dv/dt| ≤ c + v² with c = u/m + g/2, so v grows at most like a tangent, which
+        is infinite within a step of a very light car.
         """
         root = math.sqrt(FORCE / self.mass + GRAVITY / 2.0)
         angle = math.atan(MAX_SPEED / root) + root * STEP_TIME
@@ -98,9 +98,7 @@ def _acceleration(p: float, v: float, pull: float, left: bool) -> float:
 
 
 @kept(nogil=True, error_model="numpy")
-def _runge_kutta(
-    p: float, v: float, dt: float, pull: float, left: bool
-) -> tuple[float, float]:
+def _runge_kutta(p: float, v: float, dt: float, pull: float, left: bool) -> tuple:
     """(p, v) after `dt` seconds on one branch: the fifth-order Dormand–Prince step."""
     a1 = _acceleration(p, v, pull, left)
     v2 = v + dt * (a1 / 5)
@@ -141,9 +139,7 @@ def _exit_time(p: float, v: float, a: float, left: bool) -> float:
 
 
 @kept(nogil=True, error_model="numpy")
-def _cross(
-    p: float, v: float, dt: float, pull: float, left: bool
-) -> tuple[float, float, float]:
+def _cross(p: float, v: float, dt: float, pull: float, left: bool) -> tuple:
     """(p, v, seconds used) at p = 0, or after `dt` if the branch is not left.
 
     Newton steps correct the parabola's exit time for as long as they land nearer to 0:
@@ -167,8 +163,7 @@ def _cross(
 def _advance(p: float, v: float, pull: float) -> tuple[float, float]:
     """(p, v) after 0.1 s under `pull` = u / m [m/s²], bounds ignored.
 
-    A fixed step over the jump of h'' at p = 0 would be off by its length, so every step
-    that crosses is cut there and continued on the other branch.
+    A step that crosses the jump of h'' at p = 0 is cut there, then the next one begins.
     """
     left = p < 0.0
     if p == 0.0:

@@ -1,6 +1,7 @@
 """Random play before any work; `gymnasium.py` has the trial of a simulator."""
 
 import functools
+import itertools
 import reprlib
 import sys
 import traceback
@@ -68,20 +69,17 @@ def check_different(
     tasks: Sequence[Any], traces: Sequence[Sequence], episodes: int, allowed_by: str
 ) -> None:
     """Raise ConfigError if successive tasks have equal traces, one value per step."""
-    for number in range(1, len(tasks)):
-        one, other = tasks[number - 1 : number + 1]
+    pairs = itertools.pairwise(zip(tasks, traces, strict=True))
+    for number, ((one, seen), (other, again)) in enumerate(pairs, 1):
         same = (one.horizon, one.gamma) == (other.horizon, other.gamma)
-        pairs: Any = zip(traces[number - 1], traces[number], strict=False)
-        if same and all(a == b for a, b in pairs):
+        if same and all(a == b for a, b in zip(seen, again, strict=False)):
             changes = [
                 f"{name}: {getattr(one, name)} → {getattr(other, name)}"
                 for name in getattr(one, "__dataclass_fields__", ())
                 if getattr(one, name) != getattr(other, name)
             ]
-            why = (
-                f"tasks {number} and {number + 1} behave alike in {episodes} episodes "
-            )
-            why += f"of random play; if they should, {allowed_by} accepts them"
+            why = f"tasks {number} and {number + 1} behave alike in {episodes} random "
+            why += f"episodes; if they should, {allowed_by} accepts them"
             raise ConfigError("env.tasks", ", ".join(changes), why)
 
 

@@ -22,10 +22,9 @@ class GymEnv(gymnasium.Env):
     """One task behind Gymnasium's interface.
 
     `env` is an environment of the `Env` protocol, or the name of one with its
-    `constants`. Observations are its states in float64; `terminated` means absorbing;
-    Gymnasium's `max_episode_steps` cuts episodes. After a step, `info["is_success"]`
-    says whether the episode was absorbed without a negative reward. Raises ConfigError
-    for unknown names, constants and values.
+    `constants`. Observations are its states in float64; `terminated` means absorbing.
+    `info["is_success"]` says whether a step was absorbed without a negative reward.
+    Raises ConfigError for unknown names, constants and values.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
@@ -44,9 +43,7 @@ class GymEnv(gymnasium.Env):
         self.action_space = Discrete(self.task.n_actions)
         self._path: list[Floats] = []  # the episode's states
 
-    def reset(
-        self, *, seed: int | None = None, options: Any = None
-    ) -> tuple[Any, dict]:
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict]:
         """A start state; with a `seed`, the same one each time."""
         super().reset(seed=seed)
         noise = self.np_random.random(self.task.initial_noise)
@@ -74,8 +71,7 @@ class GymEnv(gymnasium.Env):
 class GymVectorEnv(VectorEnv):
     """`num_envs` episodes of one task side by side, each step one call on arrays.
 
-    Draws the same numbers as a SyncVectorEnv of `GymEnv`s: each episode has its own
-    generator, and the step after its last one resets it. Draws no pictures.
+    The same numbers as from a SyncVectorEnv of `GymEnv`s; no pictures.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
@@ -137,16 +133,14 @@ class GymVectorEnv(VectorEnv):
         return np.array(drawn).reshape(len(drawn), count)
 
 
-def _task(env: Env | str, constants: dict[str, Any]) -> Env:
-    """The environment called `env` with its constants; `env` itself if it is one."""
+def _task(env: Env | str, given: dict[str, Any]) -> Env:
+    """The environment called `env` with given constants; `env` itself if it is one."""
     if not isinstance(env, str):
-        if constants:
-            raise TypeError(f"{env} has its constants; not taken: {sorted(constants)}")
+        if given:
+            raise TypeError(f"{env} has its constants; not taken: {sorted(given)}")
         return env
-    if "horizon" in constants:
+    if "horizon" in given:
         why = "pass max_episode_steps instead: Gymnasium cuts episodes"
-        raise ConfigError("env.horizon", constants["horizon"], why)
-    plain = {
-        k: v.item() if isinstance(v, np.generic) else v for k, v in constants.items()
-    }
+        raise ConfigError("env.horizon", given["horizon"], why)
+    plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in given.items()}
     return construct("env", env_class(env), plain)

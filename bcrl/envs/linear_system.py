@@ -20,16 +20,12 @@ STATE_COST = (3.0, 1.0, 3.0, 1.0)  # diagonal, LQ task
 ACTION_COST = 0.1  # per squared unit of force, LQ task
 _DIAGONAL = np.sqrt(0.5) * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
 ACTIONS = np.vstack([[[1, 0], [0, 1], [-1, 0], [0, -1]], _DIAGONAL])
-#: preset → task → gain, friction, half-widths of the start's box (C.3; released code)
+#: Preset, task → gain, friction, half-widths of the start's box (C.3; released code)
 _PRESETS = {
-    "released": {
-        "lq": (2.0, 0.1, (0.3, 0.3, 0.3, 0.3)),
-        "target": (2.0, 1.0, (1e-3, 0.1, 0.4, 0.1)),
-    },
-    "paper": {
-        "lq": (1.0, 0.1, (0.0, 0.3, 0.0, 0.3)),
-        "target": (1.0, 0.1, (0.0, 0.1, 0.4, 0.1)),
-    },
+    ("released", "lq"): (2.0, 0.1, (0.3, 0.3, 0.3, 0.3)),
+    ("released", "target"): (2.0, 1.0, (1e-3, 0.1, 0.4, 0.1)),
+    ("paper", "lq"): (1.0, 0.1, (0.0, 0.3, 0.0, 0.3)),
+    ("paper", "target"): (1.0, 0.1, (0.0, 0.1, 0.4, 0.1)),
 }
 
 
@@ -64,13 +60,13 @@ class LinearSystem:
 
     def __post_init__(self) -> None:
         one_of("env.task", self.task, ("lq", "target"))
-        one_of("env.preset", self.preset, _PRESETS)
+        one_of("env.preset", self.preset, ("released", "paper"))
         check_episodes(self.gamma, self.horizon)
 
     @property
     def constants(self) -> tuple[float, float, tuple[float, ...]]:
         """Gain, friction and half-widths of the start box, by task and preset."""
-        return _PRESETS[self.preset][self.task]
+        return _PRESETS[self.preset, self.task]
 
     @property
     def bounds(self) -> Floats:
@@ -122,13 +118,12 @@ class LinearSystem:
 
     def before_reset(self, state: Floats, action: Ints, noise: Floats) -> Floats:
         """Where `step` leads before a fresh start replaces it, (..., 4)."""
-        arrays = (state, ACTIONS[action], ndtri(noise[..., :4]))
-        after = _moved(*map(_rows, arrays), self._dynamics)
-        return after.reshape(np.shape(state))
+        rows = map(_rows, (state, ACTIONS[action], ndtri(noise[..., :4])))
+        return _moved(*rows, self._dynamics).reshape(np.shape(state))
 
     def evaluation_states(self) -> Floats:
         """(−4, 0, 0, 0) and the corners of half the target's start box, (17, 4)."""
-        half = 0.5 * np.array(_PRESETS[self.preset]["target"][2])
+        half = 0.5 * np.array(_PRESETS[self.preset, "target"][2])
         signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 4, indexing="ij"), -1)
         return _START + half * np.vstack([np.zeros((1, 4)), signs.reshape(-1, 4)])
 

@@ -109,8 +109,7 @@ def _car_on_hill(env: Any, path: Floats, force: Any) -> Canvas:
     canvas.polygon([(1.0, top + 0.34), (1.0, top + 0.2), (1.19, top + 0.27)], GREEN)
     for y in np.arange(0.0, 0.6, 0.1):  # a car that crosses this line is lost
         canvas.line([(-1.0, y), (-1.0, y + 0.05)], RED, 2)
-    position, speed = path[-1]
-    at = min(max(position, -1.25), 1.25)
+    at = min(max(path[-1, 0], -1.25), 1.25)
     along = np.array([2e-3, _height(at + 1e-3) - _height(at - 1e-3)])
     along /= np.linalg.norm(along)
     axes = np.array([along, [-along[1], along[0]]])
@@ -125,7 +124,7 @@ def _car_on_hill(env: Any, path: Floats, force: Any) -> Canvas:
         side = np.sign(force[0])
         start = foot + (0.15 * side, 0.09) @ axes
         canvas.arrow(start, 0.25 * side * along, ORANGE, 4)
-    canvas.text(_SIZE // 2, 320, f"{speed:+.2f} m/s", "mm")
+    canvas.text(_SIZE // 2, 320, f"{path[-1, 1]:+.2f} m/s", "mm")
     canvas.text(12, 10, f"Car on the hill, {env.mass:g} kg")
     return canvas
 
@@ -159,8 +158,8 @@ def _linear_system(env: Any, path: Floats, force: Any) -> Canvas:
     if narrow:
         x0, y0, x1, y1 = scene["pathway"]
         canvas.rectangle(x0, y0, x1, y1, PAPER)
-        for x in (x0, x1):
-            canvas.line([(x, y0), (x, y1)], INK, 4)
+        canvas.line([(x0, y0), (x0, y1)], INK, 4)
+        canvas.line([(x1, y0), (x1, y1)], INK, 4)
         canvas.arrow((-1.5, -0.95), 1.6 * scene["drift"], GREY)
         canvas.text(250, 246, "drift")
     canvas.line([(left, 0), (left + side, 0)], PALE, 1)

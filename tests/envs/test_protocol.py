@@ -90,11 +90,6 @@ def test_impossible_constants_are_rejected_by_name(cls):
                 cls(**{key: bad})
 
 
-def test_an_environment_that_is_right_passes():
-    found = run(stages([variant()] * 2, LEARNER, Boost()), [0], progress=False)
-    assert list(found.stage) == [1, 2]
-
-
 def test_a_parameter_has_to_have_an_effect():
     step = {"step": lambda self, *given: OpenCorridor(1.0).step(*given)}
     ignored = dataclass(frozen=True)(type("Mine", (OpenCorridor,), step))
