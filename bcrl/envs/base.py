@@ -109,9 +109,7 @@ class Lanes:
         """Observations (..., d) of lanes that start as `initial` says."""
         return start
 
-    def step(
-        self, state: Floats, action: NDArray, noise: Floats, lanes: Any = ...
-    ) -> tuple[NDArray, NDArray, NDArray, NDArray | bool]:
+    def step(self, state: Any, action: NDArray, noise: Any, lanes: Any = ...) -> tuple:
         """Next states, rewards and ends in the chosen lanes, and which are cut.
 
         Actions (...) are for the environment's `step`, forces (..., k) for its `push`.

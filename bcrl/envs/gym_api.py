@@ -30,7 +30,7 @@ class GymEnv(gymnasium.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(
-        self, env: Env | str, render_mode: str | None = None, **constants: Any
+        self, env: Env | str, render_mode: Any = None, **constants: Any
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ConfigError("render_mode", render_mode, "must be rgb_array or None")

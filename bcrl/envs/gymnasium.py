@@ -95,9 +95,7 @@ class Gymnasium(Recipe):
         for key, value in (derived | {"state_dim": seen.state_dim}).items():
             object.__setattr__(self, key, value)
 
-    def _success(
-        self, registered: float | None, suits: str
-    ) -> tuple[str, float | None]:
+    def _success(self, registered: float | None, suits: str) -> tuple:
         """The rule, `suits` if it is `auto`, and the threshold of `threshold`."""
         rule, threshold = self.success, self.success_threshold
         one_of("env.success", rule, (*RULES, "auto"))

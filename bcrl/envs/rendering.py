@@ -70,9 +70,7 @@ class Canvas:
         return np.asarray(self._image.reduce(FINER))
 
 
-def draw(
-    env: Env, path: Floats, action: Any = None, caption: str = ""
-) -> NDArray[np.uint8]:
+def draw(env: Env, path: Floats, action: Any = None, caption: str = "") -> NDArray:
     """A picture (400, 400, 3), with a caption, of an environment in states (n, d).
 
     `action`, a number or a force (k,), is applied in the last state of `path`.

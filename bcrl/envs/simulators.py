@@ -187,16 +187,13 @@ class SimulatedLanes(Lanes):
         state = np.zeros((*self.shape, self.env.state_dim))
         return self.restart(np.ones(self.shape, bool), start, state)
 
-    def step(
-        self, state: Any, action: NDArray, noise: Any, lanes: Any = ...
-    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    def step(self, state: Any, action: NDArray, noise: Any, lanes: Any = ...) -> tuple:
         """Observations, rewards, terminated and truncated of the chosen lanes."""
         otherwise = np.zeros(self.env.state_dim), 0.0, False, True
         pairs = zip(self._chosen(lanes), action.reshape(-1).tolist(), strict=True)
         found = [self._answer(lane, "step", each, otherwise) for lane, each in pairs]
-        after, *others = map(np.array, zip(*found, strict=True))
-        reward, ended, cut = (each.reshape(action.shape) for each in others)
-        return after.reshape(*action.shape, -1), reward, ended, cut
+        parts = map(np.array, zip(*found, strict=True))
+        return tuple(x.reshape(*action.shape, *x.shape[1:]) for x in parts)
 
     def restart(self, over: Bools, start: Floats, state: Floats) -> Floats:
         """All observations; lanes that are over are reset."""

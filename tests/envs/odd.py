@@ -103,9 +103,9 @@ class NoEarlyReset(Walk):
         self.over = False
         return super().reset(seed=seed)
 
-    def give(self, seen, reward, ended):
-        self.over = ended
-        return seen, reward, ended, False, {}
+    def give(self, *found):
+        self.over = found[-1]
+        return super().give(*found)
 
 
 class WornByResets(Walk):
@@ -149,8 +149,8 @@ SAME = {
     "SignedSeed": first(lambda n: np.array(n).astype(np.int32, casting="same_value")),
     "CloseFails": {"close": lambda self: refuse()},
 }
-CLASSES = [Walk, ActionsFrom5, ModeWithoutDefault, NoEarlyReset, WornByResets]
-CLASSES += [HoldsAFile, OneBuffer]
+OWN = [ActionsFrom5, ModeWithoutDefault, NoEarlyReset]
+OWN += [WornByResets, HoldsAFile, OneBuffer]
 
 
 def bits(at):
@@ -190,8 +190,8 @@ def shared(at):
 
 def late_dice(self, action):
     self.steps += 1
-    noise = float.fromhex(os.urandom(4).hex()) if self.steps > 70 else 0.0
-    return np.array([self.steps + noise]), -1.0, False, False, {}
+    noise = os.urandom(1)[0] if self.steps > 70 else 0
+    return cell(self.steps + noise), -1.0, False, False, {}
 
 
 def words(at):
@@ -247,15 +247,15 @@ class FailsLate(Walk):
         self.doomed = 0 < seed % 64 <= self.doom
         return super().reset(seed=seed)
 
-    def give(self, seen, reward, ended):
+    def give(self, *found):
         if self.doomed:
             raise RuntimeError("the motor is stuck")
-        return seen, reward, ended, False, {}
+        return super().give(*found)
 
 
 ODD = SAME | {name: see(*shown) for name, (_, *shown) in VECTORS.items()}
 ODD |= {name: changes for name, (_, changes) in REJECTED.items()}
-CLASSES += [FailsLate, *(type(name, (Walk,), changes) for name, changes in ODD.items())]
-for cls in CLASSES:
+OTHERS = [type(name, (Walk,), changes) for name, changes in ODD.items()]
+for cls in (Walk, FailsLate, *OWN, *OTHERS):
     steps = 90 if cls.__name__ == "LateDice" else 12
     gymnasium.register(f"odd/{cls.__name__}-v0", cls, max_episode_steps=steps)

