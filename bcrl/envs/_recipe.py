@@ -104,9 +104,7 @@ def spec_of(name: str) -> EnvSpec:
     raise ConfigError("env.id", name, why)
 
 
-def _checked(
-    key: str, function: Any, arguments: Mapping[str, Any]
-) -> dict[str, inspect.Parameter]:
+def _checked(key: str, function: Any, arguments: Mapping[str, Any]) -> dict[str, Any]:
     """A function's parameters; ConfigError for an argument unknown or set by bcrl."""
     try:
         parameters = dict(inspect.signature(function).parameters)

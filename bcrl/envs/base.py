@@ -27,18 +27,16 @@ class Success(NamedTuple):
     threshold: float = 0.0
 
 
-def default_success(
-    reports: bool, low: float, high: float, threshold: float | None
-) -> str:
+def default_success(reports: bool, low: float, high: float, goal: float | None) -> str:
     """The rule of `env.success` that suits the rewards of random play.
 
     `reports`: info has a success key. `low`, `high`: least and largest reward of the
-    steps that did not terminate. `threshold`: the registered `reward_threshold`.
+    steps that did not terminate. `goal`: the registered `reward_threshold`.
     """
     if reports:
         return "info"
-    if low < high and threshold is not None:
-        return "rewarded" if high < 0 < threshold else "threshold"
+    if low < high and goal is not None:
+        return "rewarded" if high < 0 < goal else "threshold"
     return "absorbed" if high < 0 else "survived" if low > 0 else "rewarded"
 
 

@@ -21,20 +21,18 @@ UNBOUNDED = float(np.finfo(np.float32).max)  # Gymnasium warns of infinite bound
 class GymEnv(gymnasium.Env):
     """One task behind Gymnasium's interface.
 
-    `env` is an environment of the `Env` protocol, or the name of one with its
-    `constants`. Observations are its states in float64; `terminated` means absorbing.
+    `env` is an environment of the `Env` protocol, or the name of one with its `given`
+    constants. Observations are its states in float64; `terminated` means absorbing.
     `info["is_success"]` says whether a step was absorbed without a negative reward.
     Raises ConfigError for unknown names, constants and values.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
-    def __init__(
-        self, env: Env | str, render_mode: Any = None, **constants: Any
-    ) -> None:
+    def __init__(self, env: Env | str, render_mode: Any = None, **given: Any) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ConfigError("render_mode", render_mode, "must be rgb_array or None")
-        self.task, self.render_mode = _task(env, constants), render_mode
+        self.task, self.render_mode = _task(env, given), render_mode
         self.metadata = self.metadata | {"render_fps": frames_per_second(self.task)}
         everything = np.array([[-np.inf], [np.inf]]).repeat(self.task.state_dim, 1)
         bounds = getattr(self.task, "bounds", everything)
@@ -81,9 +79,9 @@ class GymVectorEnv(VectorEnv):
         env: Env | str,
         num_envs: int = 1,
         max_episode_steps: int | None = None,
-        **constants: Any,
+        **given: Any,
     ) -> None:
-        one = GymEnv(env, **constants)
+        one = GymEnv(env, **given)
         self.task, self.num_envs = one.task, num_envs
         self.single_observation_space = one.observation_space
         self.single_action_space = one.action_space

@@ -151,7 +151,7 @@ class Gymnasium(Recipe):
                 once(f"env.id={task.id}: {note}")
         if tasks[-1].verify:
             traces = [task.trial.trace for task in tasks]
-            check_different(tasks, traces, _TRIES, "env.verify=false")
+            check_different(tasks, traces, "env.verify=false")
 
 
 @functools.lru_cache(maxsize=256)

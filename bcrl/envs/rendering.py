@@ -91,7 +91,6 @@ def frames_per_second(env: Env) -> int:
 
 
 def _height(p: Any) -> Any:
-    """The hill's height at p, the integral of its slope."""
     return np.where(p < 0.0, p * p + p, p / np.sqrt(1.0 + 5.0 * p * p))
 
 
