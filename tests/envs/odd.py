@@ -190,7 +190,7 @@ def shared(at):
 
 def late_dice(self, action):
     self.steps += 1
-    noise = os.urandom(1)[0] if self.steps > 70 else 0
+    noise = int.from_bytes(os.urandom(4), "big") if self.steps > 70 else 0
     return cell(self.steps + noise), -1.0, False, False, {}
 
 

@@ -29,7 +29,7 @@ def scattered(n, seed):
 
 @pytest.mark.parametrize("mass", (0.8, 1.0, 1.2))
 def test_step_agrees_with_odeint(mass):
-    state, action = scattered(1500, seed=1)
+    state, action = scattered(600, seed=1)
     after, _, _ = CarOnHill(mass=mass).step(state, action)
     forces = np.where(action == 1, 4.0, -4.0)
     tight = {"rtol": 1e-11, "atol": 1e-11}
@@ -37,7 +37,7 @@ def test_step_agrees_with_odeint(mass):
         odeint(motion, s, [0, 0.1], args=(u, mass), **tight)[1]
         for s, u in zip(state, forces, strict=True)
     ]
-    assert (np.sign(state[:, 0]) != np.sign(after[:, 0])).sum() > 300  # many crossings
+    assert (np.sign(state[:, 0]) != np.sign(after[:, 0])).sum() > 120  # many crossings
     assert abs(after - expected).max() < 2e-7
 
 

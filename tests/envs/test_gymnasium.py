@@ -105,8 +105,8 @@ def test_q_mean_is_that_of_the_first_observations():
     for now in snapshots(learner.learn(stage, StageInit(), team)):
         resets = stream(seed, "evaluation", 1, now.count).random(n) * 2**31
         x = np.stack([env.reset(seed=int(number))[0] for number in resets])
-        sizes, flat, at = (2, 9, 6, 3), now.result.residual.online.flat[1].numpy(), 0
-        for n_in, n_out in itertools.pairwise(sizes):
+        flat, at = now.result.residual.online.flat[1].detach().numpy(), 0
+        for n_in, n_out in itertools.pairwise((2, 9, 6, 3)):
             weights = flat[at : at + n_in * n_out].reshape(n_in, n_out)
             at += n_in * n_out + n_out
             x = np.maximum(x, 0) if n_in != 2 else x
