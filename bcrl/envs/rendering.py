@@ -9,9 +9,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from bcrl.envs import Env
 from bcrl.envs.base import Floats
-from bcrl.envs.car_on_hill import CarOnHill
-from bcrl.envs.linear_system import LinearSystem
-from bcrl.envs.maze import GOAL_RADIUS, Maze
+from bcrl.envs.maze import GOAL_RADIUS
 
 _SIZE = 400  # pixels of a picture's sides
 FINER = 2  # the drawing has so many times the pixels, for smooth edges
@@ -78,8 +76,11 @@ def draw(env: Env, path: Floats, action: Any = None, caption: str = "") -> NDArr
     vectors = getattr(env, "actions", None)
     if action is not None and np.ndim(action) == 0 and vectors is not None:
         action = vectors[action]
-    drawings = {CarOnHill: _car_on_hill, Maze: _maze, LinearSystem: _linear_system}
-    drawing = drawings.get(type(env), _bars)
+    drawing = {
+        "bcrl.envs.car_on_hill": _car_on_hill,
+        "bcrl.envs.linear_system": _linear_system,
+        "bcrl.envs.maze": _maze,
+    }.get(type(env).__module__, _bars)
     canvas = drawing(env, np.asarray(path, float), action)
     canvas.text(12, _SIZE - 10, caption, "ld")
     return canvas.picture()
@@ -87,7 +88,7 @@ def draw(env: Env, path: Floats, action: Any = None, caption: str = "") -> NDArr
 
 def frames_per_second(env: Env) -> int:
     """The number of steps that an animation shows per second."""
-    return 20 if isinstance(env, LinearSystem) else 10
+    return 20 if type(env).__module__ == "bcrl.envs.linear_system" else 10
 
 
 def _height(p: Any) -> Any:
