@@ -23,10 +23,7 @@ def env_names() -> list[str]:
 
 
 def check_tasks(name: str, tasks: Sequence[Env]) -> None:
-    """Raise ConfigError for tasks that no learner can use.
-
-    A user's environments and simulators are tried; tests cover the package's own.
-    """
+    """Raise ConfigError for tasks that no learner can use, after random play."""
     for key in ("state_dim", "n_actions"):
         found = [getattr(task, key, None) for task in tasks]
         if found.count(found[0]) < len(found):
@@ -40,10 +37,7 @@ def check_tasks(name: str, tasks: Sequence[Env]) -> None:
 
 
 def env_class(name: str) -> type:
-    """The environment class called `name`; BcrlError if there is none.
-
-    BCRL_TRUST lists the user's modules, where `name` may lie, too.
-    """
+    """The class called `name`, here or in a trusted module; BcrlError for others."""
     if plugins.is_foreign(name, env_names()):
         return plugins.component("env.name", name, f"{name}.ENV")
     if name not in env_names():
@@ -52,19 +46,11 @@ def env_class(name: str) -> type:
 
 
 def tasks_of(section: Plain) -> list[Env]:
-    """The environment's tasks, easiest first, the target last.
-
-    Raises ConfigError if the section describes no tasks.
-    """
+    """An `env` section's tasks, the target last; ConfigError if it describes none."""
     if not isinstance(section, dict) or not isinstance(section.get("name"), str):
         raise ConfigError("env", section, "must have a name")
     cls = env_class(section["name"])
     constants = {k: v for k, v in section.items() if k not in _OTHERS}
-    return [construct("env", cls, constants | own) for own in _parameters(section)]
-
-
-def _parameters(section: dict) -> list[dict]:
-    """The values that each task sets; a null leaves a parameter out."""
     parameters = section.get("tasks")
     if not isinstance(parameters, dict) or not parameters:
         raise ConfigError("env.tasks", parameters, "must map a parameter to its values")
@@ -77,4 +63,5 @@ def _parameters(section: dict) -> list[dict]:
         if section.get(name):  # {}, [] and null set nothing
             raise ConfigError(f"env.{name}", section[name], f"env.tasks.{name} decides")
     rows = zip(*varied.values(), strict=True) if varied else [()]
-    return [dict(zip(varied, values, strict=True)) for values in rows]
+    own = (dict(zip(varied, values, strict=True)) for values in rows)
+    return [construct("env", cls, constants | each) for each in own]

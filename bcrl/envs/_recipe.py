@@ -58,7 +58,7 @@ class Recipe:
     def make(self, render_mode: str | None = None) -> gymnasium.Env:
         """A new environment without a time limit; ConfigError for a wrong key."""
         spec = spec_of(self.id)
-        # A copy for each simulator: one that changes a list changes no other's.
+        # Each simulator has its own lists, which it may change.
         kwargs, attributes = copy.deepcopy((self.kwargs or {}, self.attributes or {}))
         point = spec.entry_point
         creator = load_env_creator(point) if isinstance(point, str) else point
@@ -93,21 +93,18 @@ def spec_of(name: str) -> EnvSpec:
         plugins.module("env.id", name, module, PACKAGES)
     if plain in gymnasium.registry:
         return gymnasium.registry[plain]
+    similar = closest(plain, gymnasium.registry)
+    hint = f"did you mean env.id={similar}? " if similar else ""
+    why = f"isn't registered; {hint}env.id=module:Name-v0 imports the module first"
     for owner, begins in PACKAGES.items():
         missing = find_spec(owner) is None
         if missing if owner == module else plain.startswith(begins):
             install = f"pip install {owner.replace('_', '-')}, then " if missing else ""
             why = f"{install}env.id={owner}:{plain} imports the package first"
-            raise ConfigError("env.id", name, why)
-    similar = closest(plain, gymnasium.registry)
-    hint = f"did you mean env.id={similar}? " if similar else ""
-    why = f"isn't registered; {hint}env.id=module:Name-v0 imports the module first"
     raise ConfigError("env.id", name, why)
 
 
-def _checked(
-    key: str, function: Any, arguments: Mapping[str, Any]
-) -> dict[str, inspect.Parameter]:
+def _checked(key: str, function: Any, arguments: Mapping[str, Any]) -> dict[str, Any]:
     """A function's parameters; ConfigError for an argument unknown or set by bcrl."""
     try:
         parameters = dict(inspect.signature(function).parameters)
@@ -135,9 +132,8 @@ def _set_attribute(env: gymnasium.Env, key: str, value: Any) -> None:
         raise ConfigError(place, value, did_you_mean(key, known))
     before = known[key]
     old, new = np.asarray(before), np.asarray(value)
-    alike = old.dtype.kind == new.dtype.kind != "O"
-    if {old.dtype.kind, new.dtype.kind} <= set("iuf"):
-        alike = bool(np.isfinite(new).all())
+    kinds = {old.dtype.kind, new.dtype.kind}
+    alike = np.isfinite(new).all() if kinds <= {*"iuf"} else kinds in ({"b"}, {"U"})
     if not alike or old.shape != new.shape:
         raise ConfigError(place, value, f"must be like {before!r}, and finite")
     if isinstance(before, np.ndarray):
@@ -173,5 +169,4 @@ def _wrapped(env: gymnasium.Env, wrapper: Any) -> gymnasium.Env:
     try:
         return cls(env, **given)
     except Exception as error:  # of a wrapper's code
-        why = f"the wrapper failed: {type(error).__name__}: {error}"
-        raise ConfigError(place, given, why) from error
+        raise ConfigError(place, given, f"{type(error).__name__}: {error}") from error

@@ -14,8 +14,7 @@ from bcrl.errors import ConfigError
 Floats = NDArray[np.float64]
 Ints = NDArray[np.integer]
 Bools = NDArray[np.bool_]
-#: Next state (..., d), reward (...), absorbing (...).
-Step = tuple[Floats, Floats, Bools]
+Step = tuple[Floats, Floats, Bools]  # next state (..., d), reward, absorbing (...)
 
 #: Rules by which an episode counts as solved: docs/reference/gymnasium.md.
 RULES = ("absorbed", "survived", "unpunished", "rewarded", "threshold", "info")
@@ -28,11 +27,24 @@ class Success(NamedTuple):
     threshold: float = 0.0
 
 
+def default_success(reports: bool, low: float, high: float, goal: float | None) -> str:
+    """The rule of `env.success` that suits the rewards of random play.
+
+    `reports`: info has a success key. `low`, `high`: least and largest reward of the
+    steps that did not terminate. `goal`: the registered `reward_threshold`.
+    """
+    if reports:
+        return "info"
+    if low < high and goal is not None:
+        return "rewarded" if high < 0 < goal else "threshold"
+    return "absorbed" if high < 0 else "survived" if low > 0 else "rewarded"
+
+
 class Env(Protocol):
     """One task, as a frozen dataclass whose fields are its constants.
 
-    Arrays may have any leading axes (seeds, episodes); `d` is `state_dim`, `A` is
-    `n_actions`. The caller draws the noise, uniform on [0, 1).
+    Arrays may have any leading axes (seeds, episodes); d is `state_dim`, A `n_actions`.
+    The caller draws the noise, uniform on [0, 1).
     """
 
     name: ClassVar[str]
@@ -44,8 +56,7 @@ class Env(Protocol):
     gamma: float  # discount factor
     horizon: int  # steps after which an episode is cut (not absorbing)
 
-    def __hash__(self) -> int:
-        """Equal constants have equal hashes."""
+    def __hash__(self) -> int: ...
 
     def initial(self, noise: Floats) -> Floats:
         """Start states (..., d) from noise (..., initial_noise)."""
@@ -85,23 +96,18 @@ class FiniteEnv(Env, Protocol):
 @storable
 @dataclass(eq=False)
 class Lanes:
-    """Episodes of one environment side by side, one per lane; any leading axes.
-
-    These are lanes of a pure environment, whose states the caller keeps.
-    """
+    """Episodes of a pure environment side by side, one per lane; any leading axes."""
 
     env: Any
     #: Why a lane's simulator failed, by the lane's number in C order. Such a lane gives
-    #: zeros and is cut at every step; other lanes are not affected.
+    #: zeros and is cut at every step.
     failures: dict[int, str] = field(default_factory=dict)
 
     def begin(self, start: Floats) -> Floats:
         """Observations (..., d) of lanes that start as `initial` says."""
         return start
 
-    def step(
-        self, state: Floats, action: NDArray, noise: Floats, lanes: Any = ...
-    ) -> tuple[NDArray, NDArray, NDArray, NDArray | bool]:
+    def step(self, state: Any, action: NDArray, noise: Any, lanes: Any = ...) -> tuple:
         """Next states, rewards and ends in the chosen lanes, and which are cut.
 
         Actions (...) are for the environment's `step`, forces (..., k) for its `push`.
@@ -118,10 +124,9 @@ class Lanes:
 
 
 class SimulatedEnv(Env, Protocol):
-    """An environment with a hidden state, which only runs whole episodes.
+    """An environment with a hidden state: `initial` gives the numbers that reset lanes.
 
-    `initial` gives the numbers that reset a lane, each `state` is an observation. The
-    simulator draws its own noise, seeded by the reset.
+    Each `state` is an observation. The reset seeds all randomness.
     """
 
     starts: int  # random resets from which FQI's greedy policy is evaluated

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -14,8 +13,7 @@ FORCE = 4.0  # N, to the left (action 0) or to the right (action 1)
 GRAVITY = 9.81  # m/s²
 STEP_TIME = 0.1  # s that a force is held
 SUBSTEPS = 6  # Runge-Kutta steps a force is held for; error below 1e-7
-MAX_POSITION = 1.0  # m
-MAX_SPEED = 3.0  # m/s
+MAX_POSITION, MAX_SPEED = 1.0, 3.0  # m, m/s
 GRID = 10  # evaluation states along each axis
 _START = (-0.5, 0.0)  # m, m/s: at rest in the valley
 
@@ -45,12 +43,9 @@ class CarOnHill:
     gamma: float = 0.95
     horizon: int = 100
 
-    name: ClassVar[str] = "car_on_hill"
-    n_actions: ClassVar[int] = 2
-    state_dim: ClassVar[int] = 2
-    initial_noise: ClassVar[int] = 0
-    step_noise: ClassVar[int] = 0
-    actions: ClassVar[Floats] = np.array([[-FORCE], [FORCE]])
+    name, n_actions, state_dim = "car_on_hill", 2, 2
+    initial_noise, step_noise = 0, 0
+    actions = np.array([[-FORCE], [FORCE]])
 
     def __post_init__(self) -> None:
         if not 0.0 < self.mass < math.inf:
@@ -61,8 +56,8 @@ class CarOnHill:
     def bounds(self) -> Floats:
         """The lowest and the highest states that a step can lead to, (2, 2).
 
-        |dv/dt| ≤ c + v² with c = u/m + g/2, so v grows at most like a tangent. They are
-        infinite for a car so light that the tangent is infinite within a step.
+        |dv/dt| ≤ c + v² with c = u/m + g/2, so v grows at most like a tangent, which
+        is infinite within a step of a very light car.
         """
         root = math.sqrt(FORCE / self.mass + GRAVITY / 2.0)
         angle = math.atan(MAX_SPEED / root) + root * STEP_TIME
@@ -85,9 +80,8 @@ class CarOnHill:
 
     def evaluation_states(self) -> Floats:
         """A 10 × 10 grid over the bounds, position-major, shape (100, 2)."""
-        p = np.linspace(-MAX_POSITION, MAX_POSITION, GRID)
-        v = np.linspace(-MAX_SPEED, MAX_SPEED, GRID)
-        return np.stack(np.meshgrid(p, v, indexing="ij"), -1).reshape(-1, 2)
+        axes = (np.linspace(-x, x, GRID) for x in (MAX_POSITION, MAX_SPEED))
+        return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
 
 
 @kept(nogil=True, error_model="numpy")
@@ -104,9 +98,7 @@ def _acceleration(p: float, v: float, pull: float, left: bool) -> float:
 
 
 @kept(nogil=True, error_model="numpy")
-def _runge_kutta(
-    p: float, v: float, dt: float, pull: float, left: bool
-) -> tuple[float, float]:
+def _runge_kutta(p: float, v: float, dt: float, pull: float, left: bool) -> tuple:
     """(p, v) after `dt` seconds on one branch: the fifth-order Dormand–Prince step."""
     a1 = _acceleration(p, v, pull, left)
     v2 = v + dt * (a1 / 5)
@@ -147,19 +139,15 @@ def _exit_time(p: float, v: float, a: float, left: bool) -> float:
 
 
 @kept(nogil=True, error_model="numpy")
-def _cross(
-    p: float, v: float, dt: float, pull: float, left: bool
-) -> tuple[float, float, float]:
+def _cross(p: float, v: float, dt: float, pull: float, left: bool) -> tuple:
     """(p, v, seconds used) at p = 0, or after `dt` if the branch is not left.
 
-    The parabola's exit time is corrected by Newton steps for as long as they land
-    nearer to 0: where the car barely turns at 0 they need not, and an error there is
-    small, since the branches differ by v².
+    Newton steps correct the parabola's exit time for as long as they land nearer to 0:
+    where the car barely turns at 0, an error is small, since the branches differ by v².
     """
     t = _exit_time(p, v, _acceleration(p, v, pull, left), left)
-    t = max(0.0, min(t, dt))
-    best_p, best_v = _runge_kutta(p, v, t, pull, left)
-    best_t = t
+    best_t = max(0.0, min(t, dt))
+    best_p, best_v = _runge_kutta(p, v, best_t, pull, left)
     for _ in range(5):
         if best_v == 0.0 or best_p == 0.0:
             break
@@ -175,14 +163,11 @@ def _cross(
 def _advance(p: float, v: float, pull: float) -> tuple[float, float]:
     """(p, v) after 0.1 s under `pull` = u / m [m/s²], bounds ignored.
 
-    A fixed step over the jump of h'' at p = 0 would be off by its length, so every step
-    that crosses is cut there and continued on the other branch.
+    A step that crosses the jump of h'' at p = 0 is cut there, then the next one begins.
     """
+    left = p < 0.0
     if p == 0.0:
-        direction = v if v != 0.0 else _acceleration(p, v, pull, False)
-        left = direction < 0.0
-    else:
-        left = p < 0.0
+        left = (v if v != 0.0 else _acceleration(p, v, pull, False)) < 0.0
     for _ in range(SUBSTEPS):
         rest = STEP_TIME / SUBSTEPS
         for _ in range(4):  # crossings in one substep; two (in and out) can happen

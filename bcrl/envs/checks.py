@@ -1,13 +1,11 @@
-"""Random play before any work: does an environment keep its contract?
-
-Here are the checks that pure environments and simulators share, and the trial of a
-user's pure environment. `gymnasium.py` has the trial of a simulator.
-"""
+"""Random play before any work; `gymnasium.py` has the trial of a simulator."""
 
 import functools
+import itertools
+import reprlib
 import sys
 import traceback
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -28,7 +26,6 @@ _LANES = (16, 4)  # leading axes of the states in a pure environment's trial
 _STEPS = 200  # of each of these episodes
 #: Numbers that an environment needs, and the least value of each.
 _NUMBERS = {"n_actions": 1, "state_dim": 1, "initial_noise": 0, "step_noise": 0}
-_LIBRARIES = ("bcrl", "gymnasium", "numpy")  # no place of an error in foreign code
 
 #: Print a note, once per process.
 once = functools.cache(say)
@@ -38,13 +35,19 @@ def described(error: BaseException) -> str:
     """An error of foreign code on one line, with its place as `…/file.py:12`."""
     frames = traceback.extract_tb(error.__traceback__)
     files = [f for f in frames if not f.filename.startswith("<")]
-    loaded = [sys.modules[name] for name in _LIBRARIES if name in sys.modules]
-    ours = {Path(module.__file__ or "").parent for module in loaded}
+    libraries = map(sys.modules.get, ("bcrl", "gymnasium", "numpy"))
+    ours = {Path(module.__file__ or "").parent for module in libraries if module}
     foreign = [f for f in files if not ours & {*Path(f.filename).parents}]
     frame = (foreign or files)[-1]
-    first_line = str(error).strip().partition("\n")[0][:200]
-    place = f"…/{Path(frame.filename).name}:{frame.lineno}"
-    return f"{type(error).__name__}: {first_line} ({place})"
+    said, name = str(error).strip().partition("\n")[0][:200], Path(frame.filename).name
+    return f"{type(error).__name__}: {said} (…/{name}:{frame.lineno})"
+
+
+def shown(value: Any) -> str:
+    """A wrong value in a message, on one short line, with its type."""
+    if isinstance(value, np.ndarray) and value.ndim:
+        return f"an array of shape {value.shape} and type {value.dtype}"
+    return f"{' '.join(reprlib.repr(value).split())} of type {type(value).__name__}"
 
 
 def unresolved(seen: Floats) -> str:
@@ -56,31 +59,26 @@ def unresolved(seen: Floats) -> str:
         steps = seen[:, i] - low[i]
         values = np.unique(np.round(steps / span[i] * 1e9))  # rounding errors merge
         if len(np.unique(np.round(steps / fineness[i]))) < len(values):
-            where = f"component {i} of the observations lies within {low[i]:.10g} and "
-            where += f"{high[i]:.10g}, where float32 and forests resolve "
-            return f"{where}{fineness[i]:.2g}"
+            found = f"component {i} of the observations lies within {low[i]:.10g} and "
+            found += f"{high[i]:.10g}, where float32 and forests resolve "
+            return f"{found}{fineness[i]:.2g}"
     return ""
 
 
-def check_different(
-    tasks: Sequence[Any], traces: Sequence[Sequence], episodes: int, allowed_by: str
-) -> None:
+def check_different(tasks: Sequence, traces: Sequence, allowed_by: str) -> None:
     """Raise ConfigError if successive tasks have equal traces, one value per step."""
-    for number in range(1, len(tasks)):
-        one, other = tasks[number - 1 : number + 1]
+    pairs = itertools.pairwise(zip(tasks, traces, strict=True))
+    for number, ((one, seen), (other, again)) in enumerate(pairs, 1):
         same = (one.horizon, one.gamma) == (other.horizon, other.gamma)
-        pairs: Any = zip(traces[number - 1], traces[number], strict=False)
-        if same and all(a == b for a, b in pairs):
+        if same and all(a == b for a, b in zip(seen, again, strict=False)):
             changes = [
                 f"{name}: {getattr(one, name)} → {getattr(other, name)}"
                 for name in getattr(one, "__dataclass_fields__", ())
                 if getattr(one, name) != getattr(other, name)
             ]
-            why = f"tasks {number} and {number + 1} behave alike in {episodes} "
-            why += "episodes of random play, so the parameter may have no effect "
-            why += f"({allowed_by} accepts such tasks)"
-            value = ", ".join(changes) or "the same task twice"
-            raise ConfigError("env.tasks", value, why)
+            why = f"tasks {number} and {number + 1} behave alike in random play; "
+            why += f"if they should, {allowed_by} accepts them"
+            raise ConfigError("env.tasks", ", ".join(changes), why)
 
 
 def check_pure_tasks(name: str, tasks: Sequence[Env]) -> None:
@@ -92,15 +90,14 @@ def check_pure_tasks(name: str, tasks: Sequence[Env]) -> None:
         except ConfigError:
             raise
         except (Exception, SystemExit) as error:
-            broken = isinstance(error, _Broken)
-            why = str(error) if broken else f"random play failed: {described(error)}"
+            why = str(error) if isinstance(error, _Broken) else described(error)
             raise ConfigError("env.name", name, f"{why} (docs/howto/own.md)") from error
         if note := unresolved(states):
             once(f"env.name={name}: {note}; let step and initial rescale it")
         traces.append(trace)
     if getattr(tasks[-1], "verify", True):
         allowed_by = f"verify = False in the class {type(tasks[-1]).__name__}"
-        check_different(tasks, traces, int(np.prod(_LANES)), allowed_by)
+        check_different(tasks, traces, allowed_by)
 
 
 class _Broken(Exception):
@@ -112,36 +109,33 @@ def _require(kept: bool | np.bool_, why: str) -> None:
         raise _Broken(why)
 
 
-def _trial(env: Env) -> tuple[list[Hashable], Floats]:
+def _trial(env: Env) -> tuple[list[tuple[bytes, ...]], Floats]:
     """The trace of random episodes whose every answer is checked, and states (n, d)."""
     for key, least in _NUMBERS.items():
         value = getattr(env, key, None)
-        number = isinstance(value, int) and value >= least
-        _require(number, f"{key} is {value!r}, must be a number ≥ {least}")
+        fits = isinstance(value, int) and value >= least
+        _require(fits, f"{key} is {value!r}, must be a number ≥ {least}")
     check_episodes(env.gamma, env.horizon)
     rule = getattr(env, "success", "unpunished")
-    one_of("success", rule, [rule for rule in RULES if rule != "info"])
+    one_of("success", rule, RULES[:-1])  # without info
     threshold = getattr(env, "success_threshold", None)
     why = f"success_threshold is {threshold!r}, must be the return of a solved episode"
     _require(rule != "threshold" or isinstance(threshold, Real), why)
     try:
         hash(env)
     except TypeError as error:
-        why = (
-            "it must be a frozen dataclass of constants, and a tuple instead of a list"
-        )
+        why = "it must be a frozen dataclass of constants, a tuple instead of a list"
         raise _Broken(f"{why} ({error})") from error
     rng = np.random.default_rng(0)
     (state,) = _answers(env, "initial", rng.random((*_LANES, env.initial_noise)))
     _answers(env, "evaluation_states")
     states = [state]
-    trace: list[Hashable] = [state.tobytes()]
+    trace: list[tuple[bytes, ...]] = [(state.tobytes(),)]
     for _ in range(min(env.horizon, _STEPS)):
         lanes = state.shape[:-1]
         action = rng.integers(env.n_actions, size=lanes)
-        found = _answers(
-            env, "step", state, action, rng.random((*lanes, env.step_noise))
-        )
+        noise = rng.random((*lanes, env.step_noise))
+        found = _answers(env, "step", state, action, noise)
         states.append(found[0])
         trace.append(tuple(part.tobytes() for part in found))
         state = found[0][~found[2]]
@@ -151,13 +145,12 @@ def _trial(env: Env) -> tuple[list[Hashable], Floats]:
 
 
 def _answers(env: Env, method: str, *arguments: NDArray) -> list[NDArray]:
-    """The arrays that a method returns, the same ones for the same arguments."""
     before = [argument.copy() for argument in arguments]
-    one, other = (getattr(env, method)(*arguments) for _ in range(2))
+    twice = [getattr(env, method)(*arguments) for _ in range(2)]
     same = all(map(np.array_equal, arguments, before))
     _require(same, f"{method} changes its arguments; it must copy them")
     nouns = ("states", "rewards", "absorbing") if method == "step" else ("states",)
-    firsts, seconds = (x if isinstance(x, tuple) else (x,) for x in (one, other))
+    firsts, seconds = (x if isinstance(x, tuple) else (x,) for x in twice)
     why = f"{method} gives {len(firsts)} values; it must give {', '.join(nouns)}"
     _require(len(firsts) == len(seconds) == len(nouns), why)
     found = []
@@ -172,8 +165,7 @@ def _answers(env: Env, method: str, *arguments: NDArray) -> list[NDArray]:
         _require(0 not in expected, f"{method}: there are no {noun}")
         why = f"{method}: {noun} must be finite and at most {LARGEST:.3g} (float32)"
         _require((np.abs(first) <= LARGEST).all(), why)
-        why = f"{method} gives other {noun} the second time; it must depend on its "
-        why += "arguments only: randomness comes in as noise"
+        why = f"{method} gives other {noun} the second time; use noise for randomness"
         _require(np.array_equal(first, second), why)
         why = f"{method} gives one array again and again; it must make new ones"
         _require(first is not second or not first.flags.writeable, why)

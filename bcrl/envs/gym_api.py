@@ -21,21 +21,18 @@ UNBOUNDED = float(np.finfo(np.float32).max)  # Gymnasium warns of infinite bound
 class GymEnv(gymnasium.Env):
     """One task behind Gymnasium's interface.
 
-    `env` is an environment of the `Env` protocol, or the name of one with its
-    `constants`. Observations are its states in float64; `terminated` means absorbing;
-    Gymnasium's `max_episode_steps` cuts episodes. After a step, `info["is_success"]`
-    says whether the episode was absorbed without a negative reward. Raises ConfigError
-    for unknown names, constants and values.
+    `env` is an environment of the `Env` protocol, or the name of one with its `given`
+    constants. Observations are its states in float64; `terminated` means absorbing.
+    `info["is_success"]` says whether a step was absorbed without a negative reward.
+    Raises ConfigError for unknown names, constants and values.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
-    def __init__(
-        self, env: Env | str, render_mode: str | None = None, **constants: Any
-    ) -> None:
+    def __init__(self, env: Env | str, render_mode: Any = None, **given: Any) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ConfigError("render_mode", render_mode, "must be rgb_array or None")
-        self.task, self.render_mode = _task(env, constants), render_mode
+        self.task, self.render_mode = _task(env, given), render_mode
         self.metadata = self.metadata | {"render_fps": frames_per_second(self.task)}
         everything = np.array([[-np.inf], [np.inf]]).repeat(self.task.state_dim, 1)
         bounds = getattr(self.task, "bounds", everything)
@@ -44,9 +41,7 @@ class GymEnv(gymnasium.Env):
         self.action_space = Discrete(self.task.n_actions)
         self._path: list[Floats] = []  # the episode's states
 
-    def reset(
-        self, *, seed: int | None = None, options: Any = None
-    ) -> tuple[Any, dict]:
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict]:
         """A start state; with a `seed`, the same one each time."""
         super().reset(seed=seed)
         noise = self.np_random.random(self.task.initial_noise)
@@ -74,8 +69,7 @@ class GymEnv(gymnasium.Env):
 class GymVectorEnv(VectorEnv):
     """`num_envs` episodes of one task side by side, each step one call on arrays.
 
-    Draws the same numbers as a SyncVectorEnv of `GymEnv`s: each episode has its own
-    generator, and the step after its last one resets it. Draws no pictures.
+    The same numbers as from a SyncVectorEnv of `GymEnv`s; no pictures.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
@@ -85,9 +79,9 @@ class GymVectorEnv(VectorEnv):
         env: Env | str,
         num_envs: int = 1,
         max_episode_steps: int | None = None,
-        **constants: Any,
+        **given: Any,
     ) -> None:
-        one = GymEnv(env, **constants)
+        one = GymEnv(env, **given)
         self.task, self.num_envs = one.task, num_envs
         self.single_observation_space = one.observation_space
         self.single_action_space = one.action_space
@@ -137,16 +131,14 @@ class GymVectorEnv(VectorEnv):
         return np.array(drawn).reshape(len(drawn), count)
 
 
-def _task(env: Env | str, constants: dict[str, Any]) -> Env:
-    """The environment called `env` with its constants; `env` itself if it is one."""
+def _task(env: Env | str, given: dict[str, Any]) -> Env:
+    """The environment called `env` with given constants; `env` itself if it is one."""
     if not isinstance(env, str):
-        if constants:
-            raise TypeError(f"{env} has its constants; not taken: {sorted(constants)}")
+        if given:
+            raise TypeError(f"{env} has its constants; not taken: {sorted(given)}")
         return env
-    if "horizon" in constants:
+    if "horizon" in given:
         why = "pass max_episode_steps instead: Gymnasium cuts episodes"
-        raise ConfigError("env.horizon", constants["horizon"], why)
-    plain = {
-        k: v.item() if isinstance(v, np.generic) else v for k, v in constants.items()
-    }
+        raise ConfigError("env.horizon", given["horizon"], why)
+    plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in given.items()}
     return construct("env", env_class(env), plain)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -14,19 +14,17 @@ from numpy.typing import NDArray
 
 from bcrl.common.checks import one_of
 from bcrl.envs._recipe import Recipe, spec_of
-from bcrl.envs.base import RULES, Floats, Ints, check_episodes
+from bcrl.envs.base import RULES, Floats, Ints, check_episodes, default_success
 from bcrl.envs.checks import check_different, described, once, unresolved
 from bcrl.envs.simulators import SimulatedLanes, Simulator, vectors
 from bcrl.errors import BcrlError, ConfigError, at_least
 
-_TRIES = 5  # random episodes that are played in every task before any work,
-_STEPS = 10_000  # with so many steps altogether
-_SECONDS = 5.0  # and for so long
+_TRIES = 5  # random episodes that are played in every task before any work
+_STEPS, _SECONDS = 2_000, 5.0  # of each, and their time altogether
 _KEPT = 4_000_000  # numbers of their observations, to see how fine they are
 
 
-@dataclass(frozen=True)
-class Trial:
+class Trial(NamedTuple):
     """What a simulator's spaces and random episodes have shown."""
 
     n_actions: int
@@ -71,6 +69,7 @@ class Gymnasium(Recipe):
     trial: ClassVar[Trial]  # Every task gets its own value of these.
     n_actions: ClassVar[int]
     state_dim: ClassVar[int]
+    actions: ClassVar[Floats | None]  # `action_vectors` as an array (A, k)
 
     __hash__ = Recipe.__hash__
 
@@ -85,42 +84,32 @@ class Gymnasium(Recipe):
         recipe = Recipe(*(getattr(self, field.name) for field in fields(Recipe)))
         seen = trial(recipe, horizon, self.verify)
         rule, threshold = self._success(spec.reward_threshold, seen.success)
+        own = self.action_vectors
+        sizes = [len(vector) for vector in own or ()]
+        if own is not None and (sizes != sizes[:1] * seen.n_actions or not any(sizes)):
+            why = f"must be {seen.n_actions} vectors of one length, one per action"
+            raise ConfigError("env.action_vectors", own, why)
         derived = {"horizon": horizon, "success": rule, "success_threshold": threshold}
+        derived |= {"actions": None if own is None else np.array(own, np.float64)}
         derived |= {"trial": seen, "n_actions": seen.n_actions}
         for key, value in (derived | {"state_dim": seen.state_dim}).items():
             object.__setattr__(self, key, value)
-        own = self.action_vectors
-        lengths = {1} if own is None else {len(vector) for vector in own}
-        number = seen.n_actions if own is None else len(own)
-        if number != seen.n_actions or len(lengths) != 1 or 0 in lengths:
-            why = f"must be {seen.n_actions} vectors of one length, one per action"
-            raise ConfigError("env.action_vectors", own, why)
 
-    def _success(
-        self, registered: float | None, suits: str
-    ) -> tuple[str, float | None]:
+    def _success(self, registered: float | None, suits: str) -> tuple:
         """The rule, `suits` if it is `auto`, and the threshold of `threshold`."""
         rule, threshold = self.success, self.success_threshold
         one_of("env.success", rule, (*RULES, "auto"))
-        if threshold is not None and rule not in ("auto", "threshold"):
-            why = f"has no effect with env.success={rule}; env.success=threshold"
-            raise ConfigError("env.success_threshold", threshold, why)
-        if threshold is not None:
-            return "threshold", float(threshold)
         if rule == "auto":
-            rule = suits
-            value = f" (a return of {registered})" if rule == "threshold" else ""
+            rule = suits if threshold is None else "threshold"
+        if rule == "threshold" and threshold is None:
+            threshold = registered
+        if self.success == "auto":
+            value = "" if threshold is None else f" (a return of {threshold})"
             once(f"env.id={self.id}: an episode is solved if env.success={rule}{value}")
-        if rule == "threshold" and registered is None:
-            why = f"is needed: {self.id} is registered without one (a return)"
-            raise ConfigError("env.success_threshold", None, why)
-        return rule, registered if rule == "threshold" else None
-
-    @property
-    def actions(self) -> Floats | None:
-        """`action_vectors` as an array (A, k)."""
-        vectors = self.action_vectors
-        return None if vectors is None else np.array(vectors, np.float64)
+        if (rule == "threshold") == (threshold is None):
+            why = "is a return, needed with env.success=threshold and only then"
+            raise ConfigError("env.success_threshold", threshold, why)
+        return rule, threshold
 
     def initial(self, noise: Floats) -> Floats:
         """The numbers that reset lanes: the noise (..., 1) itself."""
@@ -141,21 +130,17 @@ class Gymnasium(Recipe):
             return np.array([simulator.reset(each) for each in numbers])
 
     def pictures(self, start: Floats, actions: Ints) -> Iterator[NDArray[np.uint8]]:
-        """The environment's own pictures of an episode, one more than actions.
-
-        BcrlError if it draws none.
-        """
+        """The environment's T + 1 pictures of an episode; BcrlError if it has none."""
         with closing(self.simulator("rgb_array")) as simulator:
             try:
                 simulator.reset(start[0])
-                for action in [*actions.tolist(), None]:
-                    picture: Any = simulator.env.render()
-                    yield picture
-                    if action is not None:
-                        simulator.step(action)
+                yield simulator.env.render()
+                for action in actions.tolist():
+                    simulator.step(action)
+                    yield simulator.env.render()
             except Exception as error:  # of foreign code
-                hint = "it may need pip install 'boosted-curriculum-rl[rendering]'"
-                why = f"{self.id} draws no picture ({described(error)}); {hint}"
+                why = f"{self.id} draws no picture ({described(error)}); it may need "
+                why += "pip install 'boosted-curriculum-rl[rendering]'"
                 raise BcrlError(why) from error
 
     @staticmethod
@@ -166,31 +151,27 @@ class Gymnasium(Recipe):
                 once(f"env.id={task.id}: {note}")
         if tasks[-1].verify:
             traces = [task.trial.trace for task in tasks]
-            check_different(tasks, traces, _TRIES, "env.verify=false")
+            check_different(tasks, traces, "env.verify=false")
 
 
 @functools.lru_cache(maxsize=256)
 def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
-    """Play random episodes side by side and, to `verify`, the same ones in turn.
-
-    Raises BcrlError for the first answer that breaks Gymnasium's contract.
-    """
-    simulators = [Simulator(recipe) for _ in range(_TRIES)]
-    first = simulators[0]
+    """Play random episodes side by side and, to `verify`, the same ones in turn."""
+    first, *_ = simulators = [Simulator(recipe) for _ in range(_TRIES)]
+    rng = np.random.default_rng(0)
     trace: list[tuple] = []
     seen: list[Floats] = []
     rewards: list[float] = []
     try:
         n_actions = _n_actions(first)
-        steps = min(horizon, _STEPS // _TRIES)
-        actions = np.random.default_rng(0).integers(n_actions, size=(steps, _TRIES)).T
+        actions = rng.integers(n_actions, size=(min(horizon, _STEPS), _TRIES)).T
         played = map(_episode, simulators, itertools.count(), actions.tolist())
         deadline = time.monotonic() + _SECONDS
         for outcomes in itertools.zip_longest(*played):
             running = [outcome for outcome in outcomes if outcome]
             if len(seen) * first.state_dim < _KEPT:
                 seen += [state for _, state, *_ in running]
-            if trace:
+            if trace:  # not the reset
                 rewards += [reward for *_, reward, ended in running if not ended]
             trace.append(tuple(outcome and outcome[0] for outcome in outcomes))
             if time.monotonic() > deadline:
@@ -212,32 +193,12 @@ def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
     if unsteady:
         notes.append("a reset leaves something behind, so each episode has a new one")
     if coarse := unresolved(np.array(seen)):
-        wrapper = "{name: RescaleObservation, min_obs: -1, max_obs: 1}"
-        where = "where the Box has bounds, else env.observation=module.function"
-        notes.append(f"{coarse}; rescale: env.wrappers=[{wrapper}] {where}")
+        wrapper = "env.wrappers=[{name: RescaleObservation, min_obs: -1, max_obs: 1}]"
+        notes.append(f"{coarse}; rescale: {wrapper} or env.observation=module.function")
     reports = any(simulator.reports for simulator in simulators)
     low, high = min(rewards, default=0.0), max(rewards, default=0.0)
     rule = default_success(reports, low, high, spec_of(recipe.id).reward_threshold)
     return Trial(n_actions, first.state_dim, trace, bool(unsteady), notes, rule)
-
-
-def default_success(
-    reports: bool, low: float, high: float, threshold: float | None
-) -> str:
-    """The rule of `env.success` that suits the rewards of random play.
-
-    `reports`: info has a success key. `low`, `high`: least and largest reward of the
-    steps that did not terminate. `threshold`: the registered `reward_threshold`.
-    """
-    if reports:
-        return "info"
-    if low == high:  # every step costs the same, pays the same, or gives 0
-        return "absorbed" if low < 0 else "survived" if low > 0 else "rewarded"
-    if threshold is not None and not high < 0 < threshold:
-        return "threshold"
-    if threshold is None and high < 0:
-        return "absorbed"
-    return "survived" if low > 0 else "rewarded"
 
 
 def _episode(simulator: Simulator, number: int, actions: list[int]) -> Iterator[tuple]:
@@ -251,19 +212,13 @@ def _episode(simulator: Simulator, number: int, actions: list[int]) -> Iterator[
 
 
 def _unsteady(recipe: Recipe, actions: NDArray, trace: list, fresh: bool) -> str:
-    """The step at which an episode differs when one simulator, or `fresh` ones, play.
-
-    So randomness without a seed is found, and state that outlives a reset or that
-    simulators share. Empty if all episodes repeat themselves.
-    """
+    """The first step that differs when one simulator, or `fresh` ones, play again."""
     with closing(Simulator(recipe, fresh=fresh)) as simulator:
         for number, own in enumerate(actions.tolist()):
             played = _episode(simulator, number, own)
             for t, (outcome, expected) in enumerate(zip(played, trace, strict=False)):
                 if outcome[0] != expected[number]:
-                    return (
-                        f"{f'step {t}' if t else 'the reset'} of episode {number + 1}"
-                    )
+                    return f"{f'step {t}' if t else 'reset'} of episode {number + 1}"
     return ""
 
 
@@ -275,18 +230,15 @@ def _n_actions(simulator: Simulator) -> int:
         box = "env.wrappers=[{name: DiscretizeAction, bins: 5}]"
         hint = box if isinstance(actions, spaces.Box) else "a wrapper can number them"
         why = f"has actions {actions}, only Discrete ones can be learned; {hint}"
-    elif not isinstance(space, spaces.Space):
-        why = f"has the observation_space {space!r}, expected a space of gymnasium's"
     elif recipe.observation is None and vectors(space) is None:
-        hints = ["env.observation=module.function makes an array of them"]
+        why = f"has observations {space}, no gymnasium space of vectors of one length; "
         if isinstance(space, spaces.Dict):
             keys = [str(k) for k, part in space.items() if vectors(part) is not None]
             wrapper = f"{{name: FilterObservation, filter_keys: [{', '.join(keys)}]}}"
-            hints.insert(0, f"env.wrappers=[{wrapper}]")
-        if recipe.id.startswith("minigrid:"):
-            hints.insert(0, "env.wrappers=[{name: minigrid.wrappers.ImgObsWrapper}]")
-        why = f"has observations {space}, which are no vector of a fixed length; "
-        why += ", or ".join(hints)
+            ready = "{name: minigrid.wrappers.ImgObsWrapper}"
+            wrapper = ready if recipe.id.startswith("minigrid:") else wrapper
+            why += f"env.wrappers=[{wrapper}], or "
+        why += "env.observation=module.function makes an array of them"
     else:
         return int(actions.n)
     raise ConfigError("env.id", recipe.id, why)

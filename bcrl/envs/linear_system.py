@@ -1,7 +1,7 @@
 """A point mass under force control: an LQ task, and a narrow pathway with drift."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -18,21 +18,14 @@ _GOAL_RADIUS = 0.2  # distance to the origin that counts as success
 _START = np.array([-4.0, 0.0, 0.0, 0.0])
 STATE_COST = (3.0, 1.0, 3.0, 1.0)  # diagonal, LQ task
 ACTION_COST = 0.1  # per squared unit of force, LQ task
-DIAGONAL = np.sqrt(0.5)
-ACTIONS = np.array(
-    [[1, 0], [0, 1], [-1, 0], [0, -1]]
-    + [[a * DIAGONAL, b * DIAGONAL] for a in (1, -1) for b in (1, -1)]
-)
-#: preset → task → gain, friction, half-widths of the start's box (C.3; released code)
+_DIAGONAL = np.sqrt(0.5) * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
+ACTIONS = np.vstack([[[1, 0], [0, 1], [-1, 0], [0, -1]], _DIAGONAL])
+#: Preset, task → gain, friction, half-widths of the start's box (C.3; released code)
 _PRESETS = {
-    "released": {
-        "lq": (2.0, 0.1, (0.3, 0.3, 0.3, 0.3)),
-        "target": (2.0, 1.0, (1e-3, 0.1, 0.4, 0.1)),
-    },
-    "paper": {
-        "lq": (1.0, 0.1, (0.0, 0.3, 0.0, 0.3)),
-        "target": (1.0, 0.1, (0.0, 0.1, 0.4, 0.1)),
-    },
+    ("released", "lq"): (2.0, 0.1, (0.3, 0.3, 0.3, 0.3)),
+    ("released", "target"): (2.0, 1.0, (1e-3, 0.1, 0.4, 0.1)),
+    ("paper", "lq"): (1.0, 0.1, (0.0, 0.3, 0.0, 0.3)),
+    ("paper", "target"): (1.0, 0.1, (0.0, 0.1, 0.4, 0.1)),
 }
 
 
@@ -61,23 +54,19 @@ class LinearSystem:
     horizon: int = 150
     preset: str = "released"
 
-    name: ClassVar[str] = "linear_system"
-    n_actions: ClassVar[int] = 8
-    state_dim: ClassVar[int] = 4
-    initial_noise: ClassVar[int] = 4
-    step_noise: ClassVar[int] = 8  # four for the derivative, four for a fresh start
-    actions: ClassVar[Floats] = ACTIONS
-    positions: ClassVar[tuple[int, ...]] = (0, 2)
+    name, n_actions, state_dim = "linear_system", 8, 4
+    initial_noise, step_noise = 4, 8  # four for the derivative, four for a fresh start
+    actions, positions = ACTIONS, (0, 2)
 
     def __post_init__(self) -> None:
         one_of("env.task", self.task, ("lq", "target"))
-        one_of("env.preset", self.preset, _PRESETS)
+        one_of("env.preset", self.preset, ("released", "paper"))
         check_episodes(self.gamma, self.horizon)
 
     @property
     def constants(self) -> tuple[float, float, tuple[float, ...]]:
         """Gain, friction and half-widths of the start box, by task and preset."""
-        return _PRESETS[self.preset][self.task]
+        return _PRESETS[self.preset, self.task]
 
     @property
     def bounds(self) -> Floats:
@@ -88,8 +77,8 @@ class LinearSystem:
         """
         gain, friction, spread = self.constants
         fast = [max(spread[i], (gain + 10.0 * NOISE) / friction) for i in (1, 3)]
-        found = np.array([[-np.inf], [np.inf]]).repeat(4, 1)
-        found[:, [1, 3]] = np.array([[-1.0], [1.0]]) * fast
+        high = np.array([np.inf, fast[0], np.inf, fast[1]])
+        found = np.stack([-high, high])
         if self.task == "target":
             beyond = DT * (abs(self.drift) + 10.0 * NOISE)
             found[:, 0] = WALLS[0] - beyond, WALLS[1] + beyond
@@ -109,10 +98,8 @@ class LinearSystem:
     @property
     def _dynamics(self) -> tuple[float, ...]:
         """Gain, friction, drift and the walls' x."""
-        free = (0.0, -np.inf, np.inf)
-        return *self.constants[:2], *(
-            free if self.task == "lq" else (self.drift, *WALLS)
-        )
+        free, narrow = (0.0, -np.inf, np.inf), (self.drift, *WALLS)
+        return *self.constants[:2], *(free if self.task == "lq" else narrow)
 
     def initial(self, noise: Floats) -> Floats:
         """Start states (..., 4): the box around (−4, 0, 0, 0), for noise (..., 4)."""
@@ -125,23 +112,18 @@ class LinearSystem:
     def push(self, state: Floats, force: Floats, noise: Floats) -> Step:
         """One step with any force (..., 2); the fresh start, if any, is in `noise`."""
         rows = map(_rows, (state, force, ndtri(noise[..., :4]), noise))
-        lead, spread = np.shape(state)[:-1], self.constants[2]
-        lq = self.task == "lq"
-        after, reward, arrived = _push(*rows, self._dynamics, spread, lq)
+        lead, task = np.shape(state)[:-1], (self.constants[2], self.task == "lq")
+        after, reward, arrived = _push(*rows, self._dynamics, *task)
         return after.reshape(*lead, 4), reward.reshape(lead), arrived.reshape(lead)
 
     def before_reset(self, state: Floats, action: Ints, noise: Floats) -> Floats:
         """Where `step` leads before a fresh start replaces it, (..., 4)."""
-        arrays = (state, ACTIONS[action], ndtri(noise[..., :4]))
-        after = _moved(*map(_rows, arrays), self._dynamics)
-        return after.reshape(np.shape(state))
+        rows = map(_rows, (state, ACTIONS[action], ndtri(noise[..., :4])))
+        return _moved(*rows, self._dynamics).reshape(np.shape(state))
 
     def evaluation_states(self) -> Floats:
-        """(−4, 0, 0, 0) and the corners of half the target's start box, (17, 4).
-
-        The same in both tasks, so that FQI's curves are comparable between them.
-        """
-        half = 0.5 * np.array(_PRESETS[self.preset]["target"][2])
+        """(−4, 0, 0, 0) and the corners of half the target's start box, (17, 4)."""
+        half = 0.5 * np.array(_PRESETS[self.preset, "target"][2])
         signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 4, indexing="ij"), -1)
         return _START + half * np.vstack([np.zeros((1, 4)), signs.reshape(-1, 4)])
 
@@ -164,7 +146,6 @@ class LinearSystem:
 
 
 def _rows(array: Floats) -> Floats:
-    """An array (..., k) as (n, k), for compiled code."""
     return writable(array).reshape(-1, np.shape(array)[-1])
 
 

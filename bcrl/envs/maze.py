@@ -1,7 +1,6 @@
 """The maze with two walls and an ever narrower passage (paper, §6.2 and C.2)."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,9 +45,8 @@ class Maze:
     `lattice` (default) compares exact lattice positions, w = 0.05; `paper` takes the
     text literally, goal distance < 0.1 and w = 0.025; `released` adds up the moves in
     floating point with w = 0.05 and goal distance < 0.1, as the authors' code does, so
-    on a boundary the path decides which side a position is on. Raises
-    ConfigError for a height outside [0, 1), an unknown preset, γ outside [0, 1) or a
-    horizon below 1.
+    on a boundary the path decides which side a position is on. Raises ConfigError for
+    a height or γ outside [0, 1), an unknown preset or a horizon below 1.
     """
 
     height: float = 0.95
@@ -56,14 +54,10 @@ class Maze:
     horizon: int = 200
     preset: str = "lattice"
 
-    name: ClassVar[str] = "maze"
-    n_actions: ClassVar[int] = 4
-    state_dim: ClassVar[int] = 2
-    initial_noise: ClassVar[int] = 0
-    step_noise: ClassVar[int] = 0
-    actions: ClassVar[Floats] = MOVES
-    goal: ClassVar[Floats] = GOAL  # its centre, (2,)
-    bounds: ClassVar[Floats] = np.array([[0.0, 0.0], [1.0, 1.0]])  # of the states
+    name, n_actions, state_dim = "maze", 4, 2
+    initial_noise, step_noise = 0, 0
+    actions, goal = MOVES, GOAL
+    bounds = np.array([[0.0, 0.0], [1.0, 1.0]])  # of the states
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.height < 1.0:
@@ -88,9 +82,9 @@ class Maze:
         half_width, _, on_lattice = PRESETS[self.preset]
         slack = ROUNDING if on_lattice else 0.0
         x, y = state[..., 0], state[..., 1]
-        first = (abs(x - WALL_X[0]) < half_width - slack) & (y < self.height - slack)
-        second = abs(x - WALL_X[1]) < half_width - slack
-        return first | (second & (y > 1.0 - self.height + slack))
+        first, second = (abs(x - wall) < half_width - slack for wall in WALL_X)
+        stands, hangs = y < self.height - slack, y > 1.0 - self.height + slack
+        return (first & stands) | (second & hangs)
 
     def is_goal(self, state: Floats) -> Bools:
         """Whether states (..., 2) lie at the goal, shape (...)."""

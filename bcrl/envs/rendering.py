@@ -16,16 +16,14 @@ FINER = 2  # the drawing has so many times the pixels, for smooth edges
 FONT = ImageFont.load_default(15 * FINER)
 
 #: Okabe and Ito's colours, which colour-blind people can distinguish, and greys.
-BLUE, ORANGE, GREEN = "#0072B2", "#E69F00", "#009E73"
-VERMILION, SKY = "#D55E00", "#56B4E9"
+BLUE, ORANGE, GREEN, RED, SKY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9"
 PAPER, PALE, GREY, INK = "#FBFBF9", "#E4E4DF", "#8A8A85", "#2B2B2B"
 
 
 class Canvas:
     """A square picture of [left, left + side] × [bottom, bottom + side].
 
-    Points (n, 2) and lengths have the units of this view, y upwards; widths of lines
-    are pixels.
+    Points (n, 2) and lengths have the view's units, y upwards; widths are in pixels.
     """
 
     def __init__(self, left: float, bottom: float, side: float, ground: str) -> None:
@@ -70,24 +68,19 @@ class Canvas:
         return np.asarray(self._image.reduce(FINER))
 
 
-def draw(
-    env: Env, path: Floats, action: Any = None, caption: str = ""
-) -> NDArray[np.uint8]:
-    """A picture (400, 400, 3) of an environment after the states `path` (n, d).
+def draw(env: Env, path: Floats, action: Any = None, caption: str = "") -> NDArray:
+    """A picture (400, 400, 3), with a caption, of an environment in states (n, d).
 
-    The last state is the present one; `action`, a number or a force (k,), is applied
-    in it. `caption` stands below the picture.
+    `action`, a number or a force (k,), is applied in the last state of `path`.
     """
     vectors = getattr(env, "actions", None)
     if action is not None and np.ndim(action) == 0 and vectors is not None:
         action = vectors[action]
-    drawings = {
-        "car_on_hill": _car_on_hill,
-        "maze": _maze,
-        "linear_system": _linear_system,
-    }
-    ours, _, name = type(env).__module__.rpartition(".")
-    drawing = drawings.get(name, _bars) if ours == __package__ else _bars
+    drawing = {
+        "bcrl.envs.car_on_hill": _car_on_hill,
+        "bcrl.envs.linear_system": _linear_system,
+        "bcrl.envs.maze": _maze,
+    }.get(type(env).__module__, _bars)
     canvas = drawing(env, np.asarray(path, float), action)
     canvas.text(12, _SIZE - 10, caption, "ld")
     return canvas.picture()
@@ -99,7 +92,6 @@ def frames_per_second(env: Env) -> int:
 
 
 def _height(p: Any) -> Any:
-    """The hill's height at p, the integral of its slope."""
     return np.where(p < 0.0, p * p + p, p / np.sqrt(1.0 + 5.0 * p * p))
 
 
@@ -114,9 +106,8 @@ def _car_on_hill(env: Any, path: Floats, force: Any) -> Canvas:
     canvas.line([(1.0, top), (1.0, top + 0.34)], INK, 3)
     canvas.polygon([(1.0, top + 0.34), (1.0, top + 0.2), (1.19, top + 0.27)], GREEN)
     for y in np.arange(0.0, 0.6, 0.1):  # a car that crosses this line is lost
-        canvas.line([(-1.0, y), (-1.0, y + 0.05)], VERMILION, 2)
-    position, speed = path[-1]
-    at = min(max(position, -1.25), 1.25)
+        canvas.line([(-1.0, y), (-1.0, y + 0.05)], RED, 2)
+    at = min(max(path[-1, 0], -1.25), 1.25)
     along = np.array([2e-3, _height(at + 1e-3) - _height(at - 1e-3)])
     along /= np.linalg.norm(along)
     axes = np.array([along, [-along[1], along[0]]])
@@ -125,13 +116,13 @@ def _car_on_hill(env: Any, path: Floats, force: Any) -> Canvas:
     cabin = [(-0.08, 0.1), (0.06, 0.1), (0.03, 0.16), (-0.06, 0.16)]
     canvas.polygon(foot + body @ axes, BLUE)
     canvas.polygon(foot + cabin @ axes, SKY)
-    for wheel in [(-0.075, 0.04), (0.075, 0.04)]:
-        canvas.disc(foot + wheel @ axes, 0.04, INK)
+    canvas.disc(foot + (-0.075, 0.04) @ axes, 0.04, INK)
+    canvas.disc(foot + (0.075, 0.04) @ axes, 0.04, INK)
     if force is not None:
         side = np.sign(force[0])
         start = foot + (0.15 * side, 0.09) @ axes
         canvas.arrow(start, 0.25 * side * along, ORANGE, 4)
-    canvas.text(_SIZE // 2, 320, f"{speed:+.2f} m/s", "mm")
+    canvas.text(_SIZE // 2, 320, f"{path[-1, 1]:+.2f} m/s", "mm")
     canvas.text(12, 10, f"Car on the hill, {env.mass:g} kg")
     return canvas
 
@@ -165,8 +156,8 @@ def _linear_system(env: Any, path: Floats, force: Any) -> Canvas:
     if narrow:
         x0, y0, x1, y1 = scene["pathway"]
         canvas.rectangle(x0, y0, x1, y1, PAPER)
-        for x in (x0, x1):
-            canvas.line([(x, y0), (x, y1)], INK, 4)
+        canvas.line([(x0, y0), (x0, y1)], INK, 4)
+        canvas.line([(x1, y0), (x1, y1)], INK, 4)
         canvas.arrow((-1.5, -0.95), 1.6 * scene["drift"], GREY)
         canvas.text(250, 246, "drift")
     canvas.line([(left, 0), (left + side, 0)], PALE, 1)
@@ -183,18 +174,17 @@ def _linear_system(env: Any, path: Floats, force: Any) -> Canvas:
     canvas.arrow(at, 0.8 * path[-1][[1, 3]], BLUE)
     if force is not None:
         canvas.arrow(at, 0.8 * np.asarray(force), ORANGE)
-    name = f"narrow pathway, drift {env.drift:g}" if narrow else "LQ task"
-    canvas.text(12, 10, f"Linear system, {name}")
+    task = f"narrow pathway, drift {env.drift:g}" if narrow else "LQ task"
+    canvas.text(12, 10, f"Linear system, {task}")
     return canvas
 
 
 def _bars(env: Any, path: Floats, force: Any) -> Canvas:
     """The present state's components as bars, long as x / (1 + |x|)."""
     canvas = Canvas(-1.6, -1.6, 3.2, PAPER)
-    state = path[-1]
-    height = min(0.4, 2.4 / len(state))
-    top = 0.5 * height * len(state)
-    for i, value in enumerate(state):
+    height = min(0.4, 2.4 / path.shape[1])
+    top = 0.5 * height * path.shape[1]
+    for i, value in enumerate(path[-1]):
         y, thick = top - (i + 0.5) * height, 0.3 * height
         end = value / (1.0 + abs(value)) if np.isfinite(value) else 0.0
         canvas.rectangle(-1.0, y - thick, 1.0, y + thick, PALE)

@@ -7,15 +7,7 @@ import tempfile
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import (
-    Box,
-    Dict,
-    Discrete,
-    MultiBinary,
-    MultiDiscrete,
-    Text,
-    Tuple,
-)
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Text
 
 
 def box(*shape, low=-np.inf, high=np.inf, dtype=np.float64):
@@ -50,10 +42,9 @@ class Walk(gymnasium.Env):
         return seen, reward, ended, False, {}
 
 
-def see(function, space=None):
+def see(function, space=Walk.observation_space):
     """A walk that shows `function` of its cell."""
-    spaces = {} if space is None else {"observation_space": space}
-    return {"see": lambda self: function(self.at), **spaces}
+    return {"see": lambda self: function(self.at), "observation_space": space}
 
 
 def give(function):
@@ -79,8 +70,8 @@ def first(function):
     return {"first": start}
 
 
-def fail(error):
-    raise error
+def refuse():
+    raise OSError("no")
 
 
 def cell(at):
@@ -112,9 +103,9 @@ class NoEarlyReset(Walk):
         self.over = False
         return super().reset(seed=seed)
 
-    def give(self, seen, reward, ended):
-        self.over = ended
-        return seen, reward, ended, False, {}
+    def give(self, *found):
+        self.over = found[-1]
+        return super().give(*found)
 
 
 class WornByResets(Walk):
@@ -126,8 +117,8 @@ class WornByResets(Walk):
 
 
 class HoldsAFile(Walk):
-    def __init__(self, render_mode=None, cost=0.5):
-        super().__init__(render_mode, cost)
+    def __init__(self):
+        super().__init__()
         self.file = tempfile.NamedTemporaryFile(prefix="held")  # noqa: SIM115
 
     def close(self):
@@ -153,17 +144,21 @@ SAME = {
     "ListsForArrays": see(lambda at: [at]),
     "Row": see(lambda at: np.array([[float(at)]])),
     "Bare": see(float, box()),
-    "InATuple": see(lambda at: (cell(at),), Tuple((box(1),))),
+    "InATuple": see(lambda at: (cell(at),), gymnasium.spaces.Tuple((box(1),))),
     "InADict": see(lambda at: {"a": {"b": cell(at)}}, Dict(a=Dict(b=box(1)))),
     "SignedSeed": first(lambda n: np.array(n).astype(np.int32, casting="same_value")),
-    "CloseFails": {"close": lambda self: fail(RuntimeError("nothing to close"))},
+    "CloseFails": {"close": lambda self: refuse()},
 }
-CLASSES = [Walk, ActionsFrom5, ModeWithoutDefault, NoEarlyReset, WornByResets]
-CLASSES += [HoldsAFile, OneBuffer]
+OWN = [ActionsFrom5, ModeWithoutDefault, NoEarlyReset]
+OWN += [WornByResets, HoldsAFile, OneBuffer]
 
 
 def bits(at):
     return np.array([at >> k & 1 for k in range(3)], np.int8)
+
+
+def both(at):
+    return np.r_[np.eye(7)[at], np.eye(2)[at % 2]]
 
 
 def picture(at):
@@ -179,10 +174,7 @@ PICTURE = box(4, 5, 3, low=0, high=255, dtype=np.uint8)
 #: Vectors that stand for the cell: the expected vector, what is shown, and its space.
 VECTORS = {
     "Numbered": (lambda at: np.eye(7)[at], int, Discrete(7)),
-    "Several": (
-        lambda at: np.r_[np.eye(7)[at], np.eye(2)[at % 2]],
-        *(lambda at: np.array([at, at % 2]), MultiDiscrete([7, 2])),
-    ),
+    "Several": (both, lambda at: np.array([at, at % 2]), MultiDiscrete([7, 2])),
     "Bits": (bits, bits, MultiBinary(3)),
     "Picture": (lambda at: np.full(60, 30.0 * at), picture, PICTURE),
     "InACoarserDict": (cell, lambda at: {"at": cell(at)}, Dict(at=INT)),
@@ -197,10 +189,9 @@ def shared(at):
 
 
 def late_dice(self, action):
-    """Random without a seed, but only after many steps."""
     self.steps += 1
-    noise = float.fromhex(os.urandom(4).hex()) if self.steps > 70 else 0.0
-    return np.array([self.steps + noise]), -1.0, False, False, {}
+    noise = int.from_bytes(os.urandom(4), "big") if self.steps > 70 else 0
+    return cell(self.steps + noise), -1.0, False, False, {}
 
 
 def words(at):
@@ -230,27 +221,15 @@ REJECTED = {
     "InfoIsNothing": ("info None … dict", give(lambda *found: (*found, False, None))),
     "NotMade": (
         "constructor … OSError: no … odd.py:",
-        {"__init__": lambda self: fail(OSError("no"))},
+        {"__init__": lambda _: refuse()},
     ),
-    "NoReset": ("reset … OSError: no … odd.py:", first(lambda _: fail(OSError("no")))),
+    "NoReset": ("reset … OSError: no … odd.py:", first(lambda _: refuse())),
     "Leaves": ("step … SystemExit: bye … odd.py:", give(lambda *_: sys.exit("bye"))),
-    "NoSpace": ("observation_space … None … gymnasium", {"observation_space": None}),
-    "Words": (
-        "observations … Text … filter_keys: [at]",
-        see(words, Dict(at=box(1), goal=Text(9))),
-    ),
-    "Continuous": (
-        "actions … Box … {name: DiscretizeAction, bins: 5}",
-        {"action_space": box(1, low=-1.0, high=1.0)},
-    ),
-    "SeveralActions": (
-        "actions … MultiDiscrete … Discrete",
-        {"action_space": MultiDiscrete([2, 2])},
-    ),
-    "Unseeded": (
-        "reset … episode 1 … reset(seed=…)",
-        see(lambda at: cell(at + np.random.default_rng().random())),
-    ),
+    "NoSpace": ("observations None … gymnasium", {"observation_space": None}),
+    "Words": ("Text … filter_keys: [at]", see(words, Dict(at=box(1), goal=Text(9)))),
+    "Continuous": ("actions … Box … DiscretizeAction", {"action_space": box(1)}),
+    "SeveralActions": ("MultiDiscrete", {"action_space": MultiDiscrete([2, 2])}),
+    "Unseeded": ("reset … episode 1", see(lambda at: cell(at + os.urandom(1)[0]))),
     "LateDice": ("step 71 … episode 1 … reset(seed=…)", {"step": late_dice}),
     "OutlivesAll": ("reset … episode 1 … outlives a reset", OUTLIVES),
     "Shared": ("differs … expected … share", see(shared)),
@@ -260,23 +239,23 @@ REJECTED = {
 class FailsLate(Walk):
     """Raises in the episodes of some resets, which the check before work never sees."""
 
-    def __init__(self, render_mode=None, cost=0.5, doom=0):
-        super().__init__(render_mode, cost)
+    def __init__(self, doom=0):
+        super().__init__()
         self.doom = doom
 
     def reset(self, *, seed=None, options=None):
         self.doomed = 0 < seed % 64 <= self.doom
         return super().reset(seed=seed)
 
-    def give(self, seen, reward, ended):
+    def give(self, *found):
         if self.doomed:
             raise RuntimeError("the motor is stuck")
-        return seen, reward, ended, False, {}
+        return super().give(*found)
 
 
 ODD = SAME | {name: see(*shown) for name, (_, *shown) in VECTORS.items()}
 ODD |= {name: changes for name, (_, changes) in REJECTED.items()}
-CLASSES += [FailsLate, *(type(name, (Walk,), changes) for name, changes in ODD.items())]
-for cls in CLASSES:
+OTHERS = [type(name, (Walk,), changes) for name, changes in ODD.items()]
+for cls in (Walk, FailsLate, *OWN, *OTHERS):
     steps = 90 if cls.__name__ == "LateDice" else 12
     gymnasium.register(f"odd/{cls.__name__}-v0", cls, max_episode_steps=steps)

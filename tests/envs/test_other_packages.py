@@ -24,13 +24,8 @@ REQUIRED = os.environ.get("BCRL_ENVIRONMENTS") == "required"
 #: Less than scale=smoke, which takes minutes for all of them.
 SMALLER = ("scale.max_episodes=2", "scale.max_steps=20", "env.starts=1")
 SMALLER += ("env.horizon=20", "seeds.count=1", "progress=none")
-OWN = {
-    "fqi": ("algorithm.regressor.trees=2",),
-    "dqn": (
-        *("algorithm.random_steps=10", "algorithm.learning_starts=15"),
-        "algorithm.evaluation_episodes=1",
-    ),
-}
+OWN = {"fqi": ["algorithm.regressor.trees=2"], "dqn": ["algorithm.random_steps=10"]}
+OWN["dqn"] += ["algorithm.learning_starts=15", "algorithm.evaluation_episodes=1"]
 
 
 def test_the_page_has_a_command_and_a_row_for_each():
@@ -50,11 +45,9 @@ def test_fqi_and_dqn_learn_it_plain_and_with_a_boosted_curriculum(name, tmp_path
     overrides = [o for o in overrides if not o.startswith("env.horizon=")]
     overrides.remove("algorithm=fqi,dqn")  # their budgets differ
     overrides += [*SMALLER, f"runs_dir={tmp_path}"]
-    made = [
-        each
-        for algorithm, own in OWN.items()
-        for each in plans(*overrides, f"algorithm={algorithm}", *own, multirun=True)
-    ]
+    made = []
+    for algorithm, own in OWN.items():
+        made += plans(*overrides, f"algorithm={algorithm}", *own, multirun=True)
     assert [p.variant for p in made] == ["FQI", "BC-FQI", "DQN", "BC-DQN"]
     assert all(len(p.tasks) == 2 and p.tasks[0] != p.target for p in made)
     runner.run(*made)
