@@ -53,18 +53,15 @@ def _chosen(runs: Runs, tag: str | None, names: Sequence[str]) -> list[Variant]:
         boosted = variant.method.startswith("BC-")
         return variant.tag is None, boosted, float(_last_returns(variant).mean())
 
-    best: dict[tuple[str, str], Variant] = {}
-    for variant in (v for v in runs.variants if tag in (None, v.tag)):
-        rival = best.get((variant.env, variant.family), variant)
-        best[variant.env, variant.family] = max(rival, variant, key=merit)
-    return list(best.values())
+    groups = ([v for v in runs.of(*p) if tag in (None, v.tag)] for p in runs.pairs)
+    return [max(group, key=merit) for group in groups if group]
 
 
 def _last_returns(variant: Variant) -> np.ndarray:
     """Each seed's return at the end, (S,); zeros if none was measured."""
-    names = ("greedy_return", "return")
-    measured = [variant.last(name) for name in names if name in variant.metrics]
-    return measured[0] if measured else np.zeros(len(variant.seeds))
+    zeros = np.zeros((len(variant.seeds), 1))
+    found = variant.metrics.get("greedy_return", variant.metrics.get("return", zeros))
+    return found[:, -1]
 
 
 def typical_seed(variant: Variant) -> int:
@@ -81,11 +78,8 @@ def frames(variant: Variant, seed: int) -> tuple[list[np.ndarray], int]:
         (start,) = variant.arrays(seed, "trajectory_start")
         pictures = env.pictures(start, actions)
     else:
-        title = f"{variant.name}, seed {seed}, step"
-        pictures = (
-            draw(env, states[: t + 1], action, f"{title} {t}")
-            for t, action in enumerate([*actions, None])
-        )
+        title, shown = f"{variant.name}, seed {seed}, step", enumerate([*actions, None])
+        pictures = (draw(env, states[: t + 1], a, f"{title} {t}") for t, a in shown)
     return list(pictures), 1000 // frames_per_second(env)
 
 
@@ -96,7 +90,6 @@ def _write(path: Path, pictures: list[np.ndarray], duration: int) -> Path:
     palette = middle.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE)
     plain = Image.Dither.NONE
     first, *others = (each.quantize(palette=palette, dither=plain) for each in images)
-    durations = [duration] * len(others) + [_PAUSE]
-    options = {"duration": durations, "loop": 0, "append_images": others}
-    save = partial(first.save, format="GIF", save_all=True, **options)
+    options = {"duration": [duration] * len(others) + [_PAUSE], "append_images": others}
+    save = partial(first.save, format="GIF", save_all=True, loop=0, **options)
     return write_atomically(path, save)

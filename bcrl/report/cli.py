@@ -36,8 +36,10 @@ CURVES = "curves"  # learning curves of what the paper has no figure of
 
 def _parser() -> ResultsParser:
     """The command line; its help is the reference."""
-    about = "Draw figures of finished runs, test the paper's claims, and show all of "
-    result = ResultsParser("bcrl-report", f"{about}it on one HTML page.")
+    about = (
+        "Draw figures of finished runs, test the paper's claims, write one HTML page."
+    )
+    result = ResultsParser("bcrl-report", about)
     add = result.add_argument
     text = "smoke, quick, paper, search or your own; default: %(default)s"
     add("--scale", default="quick", help=text)
@@ -45,8 +47,9 @@ def _parser() -> ResultsParser:
     known = {"choices": ["all", *FIGURES, CURVES], "default": ["all"], "metavar": "N"}
     add("--figures", nargs="+", help=f"{text}or all; default: all", **known)
     add("--tag", help="use the variants X@TAG instead of the plain ones")
-    text = "also show a greedy episode of these variants (BC-FQI), or of every "
-    text += "environment's BC- one, else its best"
+    text = (
+        "also show a greedy episode of these variants; default: each environment's best"
+    )
     add("--gif", nargs="*", metavar="VARIANT", help=text)
     text = "draw what is complete of unfinished runs, and say so in every figure"
     add("--allow-incomplete", action="store_true", help=text)
@@ -95,9 +98,9 @@ def report(
             picture = image, "Mean over seeds with 95 % intervals."
             fallback.setdefault((env, family), []).append(picture)
     texts: dict[str, str | pd.DataFrame] = {}
-    for family in sorted({family for _, family in runs.pairs}, reverse=True):
-        stem = {"FQI": "aggregate", "DQN": "aggregate_dqn"}[family]
-        texts[f"{stem}_{runs.scale}.csv"] = aggregate(runs, family)
+    for family, stem in (("FQI", "aggregate"), ("DQN", "aggregate_dqn")):
+        if family in {family for _, family in runs.pairs}:
+            texts[f"{stem}_{runs.scale}.csv"] = aggregate(runs, family)
     texts[f"claims_{suffix}.md"] = claims_report(runs, tag)
     compared = sweep_table(runs)
     if sweeps := sweep_sections(compared):
