@@ -20,9 +20,8 @@ _PAUSE = 1500  # ms that the last frame stands
 def animations(
     runs: Runs, out: Path, tag: str | None, names: Sequence[str] = ()
 ) -> tuple[list[Path], list[str]]:
-    """Write a GIF for each variant chosen; the files, and what was skipped and why.
-    `names` of variants (`BC-FQI`); without any, an environment's and family's best.
-    BcrlError if there is no variant of that name."""
+    """Write a GIF for the variants `names` (`BC-FQI`), or for each environment's best:
+    the files, and what was skipped and why. BcrlError for an unknown name."""
     files, skipped = [], []
     for variant in _chosen(runs, tag, names):
         path = gif_of(runs, variant, out)
@@ -85,10 +84,9 @@ def frames(variant: Variant, seed: int) -> tuple[list[np.ndarray], int]:
 
 def _write(path: Path, pictures: list[np.ndarray], duration: int) -> Path:
     """A GIF that repeats, all frames with the palette of a middle one."""
-    images = [Image.fromarray(picture) for picture in pictures]
+    images, plain = [Image.fromarray(each) for each in pictures], Image.Dither.NONE
     middle = images[(len(images) - 1) // 2]
     palette = middle.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE)
-    plain = Image.Dither.NONE
     first, *others = (each.quantize(palette=palette, dither=plain) for each in images)
     options = {"duration": [duration] * len(others) + [_PAUSE], "append_images": others}
     save = partial(first.save, format="GIF", save_all=True, loop=0, **options)

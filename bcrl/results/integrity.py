@@ -114,8 +114,7 @@ def _config_findings(folder: Path, documents: dict[int, Document]) -> Iterator[F
         what = f"is not a readable config ({why})" if path.exists() else "is missing"
         yield Finding(path, what, anew)
         return
-    model, odd = _odd(texts)
-    for each in odd:
+    for each, model in _odd(texts):
         found = differences(configs[model], configs[each]).items()
         shown = [f"{key}: there {a!r}, here {b!r}" for key, (a, b) in found]
         changed = "; ".join(shown[:_SHOWN_KEYS]) or "types of values"
@@ -130,8 +129,7 @@ def _index_findings(folder: Path, tables: dict[int, pd.DataFrame]) -> Iterator[F
         for seed, table in tables.items()
     }
     keys = {p: (*t.columns, t.to_numpy().tobytes()) for p, t in index.items()}
-    model, odd = _odd(keys) if keys else (folder, [])
-    for path in odd:
+    for path, model in _odd(keys):
         mine, theirs = index[path], index[model]
         names = [str(c) for c in theirs if list(mine.get(c, ())) != list(theirs[c])]
         sizes = f"{len(mine)} rows, not {len(theirs)}"
@@ -140,8 +138,8 @@ def _index_findings(folder: Path, tables: dict[int, pd.DataFrame]) -> Iterator[F
         yield Finding(path, f"{what}: configurations or versions are mixed")
 
 
-def _odd(keys: Mapping[Path, Any]) -> tuple[Path, list[Path]]:
-    """The first of the files that are as most are, and those that are not."""
+def _odd(keys: Mapping[Path, Any]) -> list[tuple[Path, Path]]:
+    """The files that are not as most are, each with the first of those."""
     counts = Counter(keys.values())
-    model = max(keys, key=lambda path: counts[keys[path]])
-    return model, [path for path in keys if keys[path] != keys[model]]
+    ranked = sorted(keys, key=lambda path: -counts[keys[path]])
+    return [(path, ranked[0]) for path in keys if keys[path] != keys[ranked[0]]]

@@ -2,7 +2,7 @@
 
 import importlib.util
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -92,9 +92,8 @@ def opened(
     made, root = logger(config["logger"]), Path(config["runs_dir"])
     folder = directory.relative_to(root).as_posix()
     with ExitStack() as stack:
-        writers = [made.open(root, f"{folder}/{seed_name(seed)}") for seed in seeds]
-        for writer in writers:
-            stack.callback(writer.close)
+        opening = (made.open(root, f"{folder}/{seed_name(seed)}") for seed in seeds)
+        writers = [stack.enter_context(closing(writer)) for writer in opening]
 
         def log(index: str, rows: Sequence[Sequence[Row]]) -> None:
             for writer, added in zip(writers, rows, strict=True):

@@ -2,7 +2,6 @@
 
 import io
 import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -122,15 +121,13 @@ def read_arrays(path: Path, *names: str) -> list[NDArray[Any]]:
         with np.load(path, allow_pickle=False) as stored:
             return [stored[name] for name in names]
     except KeyError as error:
-        what = f"does not hold what is needed ({error.args[0]})"
-        raise Finding(path, what) from error
-    except (OSError, EOFError, ValueError, TypeError, zipfile.BadZipFile) as error:
+        raise Finding(path, f"lacks what is needed ({error.args[0]})") from error
+    except Exception as error:  # whatever NumPy's readers raise
         raise Finding(path, "is not a readable NPZ") from error
 
 
 def read_folder(folder: str | Path) -> pd.DataFrame:
-    """The CSVs of all seeds in a variant's folder, unchecked, below a column `seed`.
-    BcrlError if there are none."""
+    """All CSVs in a variant's folder, unchecked, with a column `seed`, or BcrlError."""
     numbers = layout.recorded_seeds(Path(folder), "csv")
     if not numbers:
         raise BcrlError(f"{folder}: there is no seed_*.csv")

@@ -5,12 +5,11 @@ import pandas as pd
 import pytest
 
 from bcrl.errors import BcrlError
-from bcrl.report.claims.document import claims_report
+from bcrl.report.claims import claims_report
 from bcrl.report.figures import style
 from bcrl.report.figures.linear import figure_4a, figure_4b, pretraining, prior
 from bcrl.report.load import load_runs
-from bcrl.report.sweeps import sweep_sections, sweep_table
-from bcrl.report.tables import number
+from bcrl.report.tables import number, sweep_sections, sweep_table
 from tests.report.runs import (
     SEVEN,
     csv_of,

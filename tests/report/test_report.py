@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from bcrl.report import statistics as st
-from bcrl.report.claims.document import claims_report
-from bcrl.report.claims.judge import verdict
+from bcrl.report.claims import claims_report, verdict
 from bcrl.report.figures import curves, style
 from bcrl.report.figures.maze import figure_3, seed_mean_value
 from bcrl.report.load import load_runs
