@@ -43,8 +43,7 @@ def _residual(variant: Variant, start: int, end: int) -> np.ndarray:
 
 
 def _before_target(variant: Variant, metric: str) -> np.ndarray:
-    """Mean of a metric over the ends of the stages before the target, (S,). Those of
-    the curriculum's second half: T5 to T9 of ten tasks."""
+    """Mean over the later stages' ends before the target, (S,): T5 to T9 of ten."""
     n = int(variant.stage[-1])
     if n == 1:
         raise NotMeasurable(f"{variant.name} has one stage only")

@@ -36,7 +36,7 @@ CURVES = "curves"  # learning curves of what the paper has no figure of
 def _parser() -> ResultsParser:
     """The command line; its help is the reference."""
     about = (
-        "Draw figures of finished runs, test the paper's claims, write one HTML page."
+        "Draw figures of finished runs, test the paper's claims, write an HTML page."
     )
     result = ResultsParser("bcrl-report", about)
     add = result.add_argument
@@ -46,9 +46,7 @@ def _parser() -> ResultsParser:
     known = {"choices": ["all", *FIGURES, CURVES], "default": ["all"], "metavar": "N"}
     add("--figures", nargs="+", help=f"{text}or all; default: all", **known)
     add("--tag", help="use the variants X@TAG instead of the plain ones")
-    text = (
-        "also show a greedy episode of these variants; default: each environment's best"
-    )
+    text = "also show a greedy episode of these variants, or each environment's best"
     add("--gif", nargs="*", metavar="VARIANT", help=text)
     text = "draw what is complete of unfinished runs, and say so in every figure"
     add("--allow-incomplete", action="store_true", help=text)

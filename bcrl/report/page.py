@@ -34,7 +34,7 @@ def page(
     """The page of one scale's runs. `figures` that the paper doesn't have are for
     browsers that run no scripts; `agents` move."""
     notes, claims = runs.notes_on(tag), claims_sections(runs, tag)
-    return _TEMPLATES.get_template("page.html").render(
+    return _JINJA.get_template("page.html").render(
         {"version": __version__, "texts": TEXTS, "runs": runs, "tag": tag},
         notes=notes,
         incomplete=incomplete(notes),
@@ -165,10 +165,8 @@ def _sha256(text: str) -> str:
 
 
 _BLOCKS = {"undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
-_TEMPLATES = Environment(
-    loader=PackageLoader("bcrl.report"), autoescape=True, **_BLOCKS
-)
+_JINJA = Environment(loader=PackageLoader("bcrl.report"), autoescape=True, **_BLOCKS)
 _STRICT = {"separators": (",", ":"), "allow_nan": False, "ensure_ascii": False}
-_TEMPLATES.policies["json.dumps_kwargs"] = _STRICT
-_TEMPLATES.filters |= {"prose": _prose, "url": _url, "sha256": _sha256}
-_TEMPLATES.filters["env_title"] = env_title
+_JINJA.policies["json.dumps_kwargs"] = _STRICT
+_JINJA.filters |= {"prose": _prose, "url": _url, "sha256": _sha256}
+_JINJA.filters["env_title"] = env_title

@@ -11,8 +11,7 @@ _RESAMPLES = 10_000
 LEVEL = 0.95
 MOST_DRAWS = 4_000_000  # resampled seeds that are held in memory at a time
 _SEED = 20_220_425  # every interval draws from its own generator, started from this
-#: Below this a percentile bootstrap is far too narrow: no verdict is given.
-FEWEST_SEEDS = 5
+FEWEST_SEEDS = 5  # for a verdict: the bootstrap of fewer is far too narrow
 Interval = tuple[float, float]  # closed; both ends are nan where the data allow none
 
 
@@ -38,12 +37,9 @@ def bootstrap(
         first, *rest = (statistic(each, axis=axis) for each in drawn)
         return first - rest[0] if rest else first
 
-    batch, rng = (
-        max(1, MOST_DRAWS // max(map(len, given))),
-        np.random.default_rng(_SEED),
-    )
-    options = {"n_resamples": _RESAMPLES, "batch": batch, "rng": rng}
-    options |= {"confidence_level": LEVEL, "method": "percentile", "vectorized": True}
+    options = {"confidence_level": LEVEL, "method": "percentile", "vectorized": True}
+    options["batch"] = max(1, MOST_DRAWS // max(map(len, given)))
+    options |= {"n_resamples": _RESAMPLES, "rng": np.random.default_rng(_SEED)}
     low, high = stats.bootstrap(given, of, **options).confidence_interval
     return float(low), float(high)
 
@@ -66,8 +62,7 @@ def bootstrap_curves(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def share_interval(successes: int, n: int) -> Interval:
-    """95 % Wilson score interval of a share. Used for shares of seeds, where the
-    bootstrap of 0 of n has no width (Wilson 1927)."""
+    """95 % score interval of a share (Wilson 1927); a bootstrap of 0 has no width."""
     found = stats.binomtest(successes, n).proportion_ci(LEVEL, method="wilson")
     return float(found.low), float(found.high)
 

@@ -121,14 +121,12 @@ def _texts(variant: Variant) -> dict[str, str]:
 
 def _measured(variant: Variant) -> dict[str, np.ndarray]:
     """Late and last return and success rate, (S,) each; nan for what FQI lacks."""
-    dqn, nothing = variant.family == "DQN", np.array([np.nan])
-    success = variant.metrics.get("solved", nothing[None])[:, -1]
-    last = variant.metrics.get("return", nothing[None])[:, -1]
-    return {
-        "late_return": variant.late("return") if dqn else nothing,
-        "last_return": last,
-        "success_rate": variant.late("success_rate") if dqn else success,
-    }
+    names, nothing = ("return", "solved"), np.array([[np.nan]])
+    last, success = (variant.metrics.get(name, nothing)[:, -1] for name in names)
+    late = nothing
+    if variant.family == "DQN":
+        late, success = variant.late("return"), variant.late("success_rate")
+    return {"late_return": late, "last_return": last, "success_rate": success}
 
 
 def sweep_sections(table: pd.DataFrame) -> list[Section]:

@@ -48,8 +48,7 @@ class Variant:
     `stage` and `task` (I,) are 1-based; `index` (I,) counts the iterations or, in the
     DQN family, the environment steps of all stages so far; `metrics` are (S, I);
     `sidecars` are the seeds' JSONs; `failed` are seeds that diverged and are left out.
-    The folder's `name` is the `method` and perhaps its `tag`: `BC-FQI@released`.
-    """
+    The folder's `name` is the `method` and perhaps its `tag`: `BC-FQI@released`."""
 
     folder: Path
     family: str

@@ -21,14 +21,13 @@ _NAME = re.compile(rf"{layout.SEED}([0-9]+)\.({'|'.join(layout.SUFFIXES)})")
 
 
 class Checked(NamedTuple):
-    """A variant's folder: what is wrong, JSONs by seed, CSVs of the complete seeds, and
-    the seeds that were to be made so far."""
+    """A variant's folder: what is wrong, JSONs by seed, CSVs of the complete seeds."""
 
     folder: Path
     findings: list[Finding]
     documents: dict[int, Document]
     tables: dict[int, pd.DataFrame]
-    requested: set[int]
+    requested: set[int]  # the seeds that were to be made so far
 
 
 def check_tree(

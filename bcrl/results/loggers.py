@@ -56,8 +56,7 @@ class _Events(Writer):
     def __init__(self, folder: Path) -> None:
         from torch.utils.tensorboard import SummaryWriter  # slow to import
 
-        # Whatever an interrupted process has logged gives way to what comes.
-        self._events = SummaryWriter(folder, purge_step=0)
+        self._events = SummaryWriter(folder, purge_step=0)  # a resumed run logs anew
 
     def write(self, count: int, row: Row) -> None:
         for name, value in row.items():

@@ -97,8 +97,7 @@ def shared_spans(methods: Methods) -> list[style.Span]:
 def _panels(
     methods: Methods, labels: Mapping[str, str], size: tuple[float, float], **how: Any
 ) -> tuple[Figure, list[Axes]]:
-    """Panels of `labels`' metrics, _COLUMNS beside each other, tasks shaded; `how` to
-    draw: as in `draw_metric`."""
+    """Panels of `labels`' metrics, tasks shaded; `how` is for `draw_metric`."""
     figure, n = Figure(figsize=size), len(labels)
     columns, spans = min(_COLUMNS, n), shared_spans(methods)
     grid = figure.subplots(math.ceil(n / columns), columns, squeeze=False)

@@ -131,9 +131,8 @@ def _draw_environment(axes: Axes, variant: Variant) -> None:
     axes.set(xlim=(x0 - margin, x1 + margin), ylim=(y0 - length / 3, y1 + length / 3))
     axes.set_title("target task", pad=4)
     axes.set_facecolor("0.88")
-    axes.add_patch(
-        Rectangle((x0, y0), length, y1 - y0, facecolor="w", edgecolor="none")
-    )
+    strip = {"facecolor": "white", "edgecolor": "none"}
+    axes.add_patch(Rectangle((x0, y0), length, y1 - y0, **strip))
     axes.hlines([y0, y1], x0, x1, color="0.5", linewidth=0.8, linestyle=(0, (3, 2)))
     axes.vlines([x0, x1], *axes.get_ylim(), color="black", linewidth=2.2)
     place = {"facecolor": style.colour("B"), "edgecolor": "black"}
@@ -170,8 +169,7 @@ def figure_4b(runs: Runs, tag: str | None = None) -> Figure:
     variant = next(iter(methods.values()))
     _draw_environment(panels[2], variant)
     shown = {v.method: v for v in found.values()} or {variant.method: variant}
-    what = (
-        "one seed per panel, own colour scales; arrows: greedy action at zero velocity"
-    )
+    what = "one seed per panel, own colour scales; "
+    what += "arrows: greedy action at zero velocity"
     style.footer(figure, runs, shown, what, compares=False)
     return figure

@@ -13,7 +13,6 @@ from bcrl.report.variants import METHODS, Methods, Runs, Variant
 
 _MARGIN = 0.025  # half a lattice cell
 _SPREAD = 0.012  # how far apart the seeds' trajectories are drawn, in maze lengths
-_SHOWN_MAZES = 4
 
 
 def _draw_walls(axes: Axes, walls: np.ndarray, filled: bool = True) -> None:
@@ -88,7 +87,7 @@ def figure_3(runs: Runs, tag: str | None = None) -> Figure:
     panels = figure.subfigures(1, 3, width_ratios=(1.0, 1.28, 1.0), wspace=0.03)
     for panel, title in zip(panels, titles, strict=True):
         panel.suptitle(title, fontsize=9)
-    shown = np.linspace(0, len(walls) - 1, _SHOWN_MAZES).round().astype(int)
+    shown = np.linspace(0, len(walls) - 1, 4).round().astype(int)
     for axes, task in zip(panels[0].subplots(2, 2).flat, shown, strict=True):
         _draw_walls(axes, walls[task])
         _draw_ends(axes, goal, path[0])
