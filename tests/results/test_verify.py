@@ -42,9 +42,7 @@ def verified(tmp_path, capsys):
 
 def test_nothing_wrong(folder, tmp_path, verified):
     """Other files, other white space and keys that decide no number are no fault."""
-    (tmp_path / "figures").mkdir()
-    others = [".seed_0007.lock", ".config.lock", ".seed_0001.csv.77.tmp"]
-    for name in (*others, "checkpoint_0007.npz", "../../../figures/figure_1.png"):
+    for name in (".seed_0007.lock", ".seed_0001.csv.77.tmp", "checkpoint_0007.npz"):
         (folder / name).write_text("")
     path = folder / "seed_0001.json"
     path.write_text(path.read_text().replace("\n", "\n\n"))
@@ -63,14 +61,12 @@ def test_seeds_may_be_equal_and_environments_record_anything(tmp_path, verified)
     assert verified()[0] == 0
 
 
-#: File, how it is spoilt (its new content, or entries of its JSON that are changed as if
-#: the run had left them so), a part of the message.
+#: File, its new content or entries of its JSON to be resealed, a part of the message.
 BROKEN = [
     ("seed_0001.json", '{"status": "compl', "JSON"),
     ("seed_0001.json", "[" * 100_000, "JSON"),
     ("seed_0001.json", {"schema": 1}, "schema 1, not 2"),
     ("seed_0001.json", {"seed": 4}, "seed 4, not 1"),
-    ("seed_0001.json", {"scale": "paper"}, "scale 'paper', not 'smoke'"),
     ("seed_0001.json", {"tag": None}, "tag None, not 'mine'"),
     ("seed_0001.json", lambda text: text.replace(": 5", ": 5.0"), "digest"),
     ("seed_0001.json", None, "missing"),
@@ -184,9 +180,8 @@ def test_what_is_incomplete_is_named(folder, tmp_path, verified, pattern, how, w
         load_runs(tmp_path, "smoke")
 
 
-@pytest.mark.parametrize("name", ["", "nowhere", "file"])
+@pytest.mark.parametrize("name", ["", "nowhere"])
 def test_no_folder_no_runs(tmp_path, capsys, name):
-    (tmp_path / "file").write_text("")
     assert verify.main([str(tmp_path / name)]) == 2
     assert f"bcrl-verify: {tmp_path / name} " in capsys.readouterr().err
 
