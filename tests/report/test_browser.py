@@ -87,9 +87,8 @@ class Page:
 
     def values(self, selector: str) -> dict[str, float]:
         """What the tooltip in a panel says: method → value."""
-        names, values = (
-            self.texts(f"{selector} .tip td:nth-child({k})") for k in (2, 3)
-        )
+        cells = f"{selector} .tip td:nth-child"
+        names, values = self.texts(f"{cells}(2)"), self.texts(f"{cells}(3)")
         numbers = [float(value.replace("−", "-")) for value in values]
         return dict(zip(names, numbers, strict=True))
 

@@ -51,16 +51,6 @@ def test_nothing_wrong(folder, tmp_path, verified):
     assert verified() == (0, ["1 variants, 4 seeds complete; nothing wrong"])
 
 
-def test_seeds_may_be_equal_and_environments_record_anything(tmp_path, verified):
-    plan = made_up_plan(tmp_path, "car_on_hill", "FQI", range(3))
-    write_seeds(plan, lambda seed: table(0))
-    env = {"name": "mine", "metrics": ["angle"]}
-    plan = made_up_plan(tmp_path, "mine", "FQI", range(2), config={"env": env})
-    row = {"stage": 1, "task": 1, "iteration": 1, "angle": np.nan}
-    write_seeds(plan, lambda seed: pd.DataFrame([row]))
-    assert verified()[0] == 0
-
-
 #: File, its new content or entries of its JSON to be resealed, a part of the message.
 BROKEN = [
     ("seed_0001.json", '{"status": "compl', "JSON"),
