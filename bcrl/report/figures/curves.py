@@ -17,7 +17,7 @@ from bcrl.report.variants import Methods, Runs, Variant
 
 POINTS = 300  # of a curve that are drawn, about
 _COLUMNS = 3  # panels beside each other
-COUNTED = {"FQI": "iteration", "DQN": "environment steps of all stages"}  # by an axis
+COUNTED = {"FQI": "iteration", "DQN": "environment steps of all stages"}  # on axes
 _LABELS = yaml.safe_load(Path(__file__).with_name("labels.yaml").read_text("utf-8"))
 _SEEDS = {"linewidth": 0.5, "linestyle": (0, (3, 2)), "alpha": 0.45, "zorder": 1.9}
 _TWO_ERRORS = "mean ± 2 standard errors over seeds"
