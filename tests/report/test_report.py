@@ -232,7 +232,7 @@ def test_incomplete_seeds_are_named_and_left_out_on_request_only(runs_dir, capsy
         path.unlink()
     reseal(folder / "seed_0004.json", status="running")
     reseal(folder / "seed_0005.json", status="failed: non-finite weights")
-    names = ("seed 2", '"running"', '"failed: non-finite weights"')
+    names = ("seeds 2", '"running"', '"failed: non-finite weights"')
     assert report(runs_dir, "--figures", "2") == 2  # the aggregate has both
     err = capsys.readouterr().err
     assert all(name in err for name in (*names, "--allow-incomplete"))
@@ -246,7 +246,7 @@ def test_incomplete_seeds_are_named_and_left_out_on_request_only(runs_dir, capsy
     assert shown in curves.figure_1(runs).get_supxlabel().splitlines()
     document = (runs_dir / "figures" / "claims_smoke.md").read_text()
     assert f"**{shown}**" in document.splitlines()[:4]
-    assert "seed 2" in document.split("## Notes")[1]
+    assert "seeds 2" in document.split("## Notes")[1]
     fqi = {"FQI": runs.methods("car_on_hill", None)["FQI"]}
     assert remarks(runs, fqi, compares=False) == []
 
