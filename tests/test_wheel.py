@@ -88,7 +88,7 @@ def test_it_runs_reports_and_verifies_in_an_empty_folder(outside, tmp_path):
     assert facts["git"] == {"revision": None, "dirty": False}
     assert facts["versions"]["bcrl"] == "0.1.0"
     text, _ = outside("bcrl-verify")
-    assert "1 variant, 2 seeds complete; nothing wrong" in text
+    assert "1 variants, 2 seeds complete; nothing wrong" in text
     outside("bcrl-report", "--scale", "smoke")
     assert list((tmp_path / "runs" / "figures").iterdir())
     for option in ("--help", "--status"):

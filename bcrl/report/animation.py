@@ -20,9 +20,8 @@ _PAUSE = 1500  # ms that the last frame stands
 def animations(
     runs: Runs, out: Path, tag: str | None, names: Sequence[str] = ()
 ) -> tuple[list[Path], list[str]]:
-    """Write a GIF for each variant chosen; the files, and what was skipped and why.
-    `names` of variants (`BC-FQI`); without any, an environment's and family's best.
-    BcrlError if there is no variant of that name."""
+    """Write a GIF for the variants `names` (`BC-FQI`), or for each environment's best:
+    the files, and what was skipped and why. BcrlError for an unknown name."""
     files, skipped = [], []
     for variant in _chosen(runs, tag, names):
         path = gif_of(runs, variant, out)
@@ -53,18 +52,15 @@ def _chosen(runs: Runs, tag: str | None, names: Sequence[str]) -> list[Variant]:
         boosted = variant.method.startswith("BC-")
         return variant.tag is None, boosted, float(_last_returns(variant).mean())
 
-    best: dict[tuple[str, str], Variant] = {}
-    for variant in (v for v in runs.variants if tag in (None, v.tag)):
-        rival = best.get((variant.env, variant.family), variant)
-        best[variant.env, variant.family] = max(rival, variant, key=merit)
-    return list(best.values())
+    groups = ([v for v in runs.of(*p) if tag in (None, v.tag)] for p in runs.pairs)
+    return [max(group, key=merit) for group in groups if group]
 
 
 def _last_returns(variant: Variant) -> np.ndarray:
     """Each seed's return at the end, (S,); zeros if none was measured."""
-    names = ("greedy_return", "return")
-    measured = [variant.last(name) for name in names if name in variant.metrics]
-    return measured[0] if measured else np.zeros(len(variant.seeds))
+    zeros = np.zeros((len(variant.seeds), 1))
+    found = variant.metrics.get("greedy_return", variant.metrics.get("return", zeros))
+    return found[:, -1]
 
 
 def typical_seed(variant: Variant) -> int:
@@ -81,22 +77,17 @@ def frames(variant: Variant, seed: int) -> tuple[list[np.ndarray], int]:
         (start,) = variant.arrays(seed, "trajectory_start")
         pictures = env.pictures(start, actions)
     else:
-        title = f"{variant.name}, seed {seed}, step"
-        pictures = (
-            draw(env, states[: t + 1], action, f"{title} {t}")
-            for t, action in enumerate([*actions, None])
-        )
+        title, shown = f"{variant.name}, seed {seed}, step", enumerate([*actions, None])
+        pictures = (draw(env, states[: t + 1], a, f"{title} {t}") for t, a in shown)
     return list(pictures), 1000 // frames_per_second(env)
 
 
 def _write(path: Path, pictures: list[np.ndarray], duration: int) -> Path:
     """A GIF that repeats, all frames with the palette of a middle one."""
-    images = [Image.fromarray(picture) for picture in pictures]
+    images, plain = [Image.fromarray(each) for each in pictures], Image.Dither.NONE
     middle = images[(len(images) - 1) // 2]
     palette = middle.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE)
-    plain = Image.Dither.NONE
     first, *others = (each.quantize(palette=palette, dither=plain) for each in images)
-    durations = [duration] * len(others) + [_PAUSE]
-    options = {"duration": durations, "loop": 0, "append_images": others}
-    save = partial(first.save, format="GIF", save_all=True, **options)
+    options = {"duration": [duration] * len(others) + [_PAUSE], "append_images": others}
+    save = partial(first.save, format="GIF", save_all=True, loop=0, **options)
     return write_atomically(path, save)

@@ -12,12 +12,11 @@ from bcrl.common.files import make_directory, write_text
 from bcrl.common.terminal import ready, say, show
 from bcrl.errors import BcrlError
 from bcrl.report.animation import animations, gif_of
-from bcrl.report.claims.document import claims_report
+from bcrl.report.claims import claims_report
 from bcrl.report.figures import curves, linear, maze, style
 from bcrl.report.load import load_runs
 from bcrl.report.page import page
-from bcrl.report.sweeps import sweep_sections, sweep_table
-from bcrl.report.tables import TEXTS, aggregate
+from bcrl.report.tables import TEXTS, aggregate, sweep_sections, sweep_table
 from bcrl.report.variants import COMPARED, LINEAR, Runs, env_title
 from bcrl.results.arguments import ResultsParser
 
@@ -36,8 +35,10 @@ CURVES = "curves"  # learning curves of what the paper has no figure of
 
 def _parser() -> ResultsParser:
     """The command line; its help is the reference."""
-    about = "Draw figures of finished runs, test the paper's claims, and show all of "
-    result = ResultsParser("bcrl-report", f"{about}it on one HTML page.")
+    about = (
+        "Draw figures of finished runs, test the paper's claims, write an HTML page."
+    )
+    result = ResultsParser("bcrl-report", about)
     add = result.add_argument
     text = "smoke, quick, paper, search or your own; default: %(default)s"
     add("--scale", default="quick", help=text)
@@ -45,8 +46,7 @@ def _parser() -> ResultsParser:
     known = {"choices": ["all", *FIGURES, CURVES], "default": ["all"], "metavar": "N"}
     add("--figures", nargs="+", help=f"{text}or all; default: all", **known)
     add("--tag", help="use the variants X@TAG instead of the plain ones")
-    text = "also show a greedy episode of these variants (BC-FQI), or of every "
-    text += "environment's BC- one, else its best"
+    text = "also show a greedy episode of these variants, or each environment's best"
     add("--gif", nargs="*", metavar="VARIANT", help=text)
     text = "draw what is complete of unfinished runs, and say so in every figure"
     add("--allow-incomplete", action="store_true", help=text)
@@ -57,11 +57,10 @@ def _parser() -> ResultsParser:
 def report(
     runs: Runs, out: Path, figures: Sequence[str], tag: str | None
 ) -> tuple[list[Path], list[str]]:
-    """Write what `figures` names and all tables and documents. The files, and what was
-    skipped and why."""
+    """Write these figures and all documents: the files, what was skipped and why."""
     suffix = f"{runs.scale}@{tag}" if tag else runs.scale
     files: list[Path] = []
-    skipped, drawn, fallback = [], {}, {}
+    skipped, drawn = [], {}
 
     def save(name: str, title: str, draw: Callable[..., Figure], *of: object) -> Path:
         """The PNG of a figure that was drawn and saved."""
@@ -93,28 +92,29 @@ def report(
             of = (curves.figure_curves, runs, env, family, each)
             image = save(f"curves_{env}_{family}_{place}", title, *of)
             picture = image, "Mean over seeds with 95 % intervals."
-            fallback.setdefault((env, family), []).append(picture)
-    texts: dict[str, str | pd.DataFrame] = {}
-    for family in sorted({family for _, family in runs.pairs}, reverse=True):
-        stem = {"FQI": "aggregate", "DQN": "aggregate_dqn"}[family]
-        texts[f"{stem}_{runs.scale}.csv"] = aggregate(runs, family)
-    texts[f"claims_{suffix}.md"] = claims_report(runs, tag)
+            drawn.setdefault((env, family), []).append(picture)
+
+    def write(name: str, text: str | pd.DataFrame) -> None:
+        if isinstance(text, pd.DataFrame):
+            text = text.to_csv(index=False, lineterminator="\n")
+        files.append(write_text(out / name, text))
+
+    for family, stem in (("FQI", "aggregate"), ("DQN", "aggregate_dqn")):
+        if family in {family for _, family in runs.pairs}:
+            write(f"{stem}_{runs.scale}.csv", aggregate(runs, family))
+    write(f"claims_{suffix}.md", claims_report(runs, tag))
     compared = sweep_table(runs)
     if sweeps := sweep_sections(compared):
         title = f"# Variants compared, scale {runs.scale}\n"
         parts = [title, TEXTS["sweeps"], *map(str, sweeps)]
-        texts[f"sweep_{runs.scale}.md"] = "\n".join(parts)
-        texts[f"sweep_{runs.scale}.csv"] = compared
+        write(f"sweep_{runs.scale}.md", "\n".join(parts))
+        write(f"sweep_{runs.scale}.csv", compared)
     agents = [
         (path, f"{env_title(variant.env)}: {variant.name}")
         for variant in runs.variants
         if tag in (None, variant.tag) and (path := gif_of(runs, variant, out)).exists()
     ]
-    html = page(runs, tag, drawn, fallback, agents, sweeps)
-    for name, text in (texts | {f"report_{suffix}.html": html}).items():
-        if isinstance(text, pd.DataFrame):
-            text = text.to_csv(index=False, lineterminator="\n")
-        files.append(write_text(out / name, text))
+    write(f"report_{suffix}.html", page(runs, tag, drawn, agents, sweeps))
     return files, skipped
 
 

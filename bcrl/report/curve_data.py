@@ -45,8 +45,7 @@ def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, 
         "labels": {metric: curves.label(family, metric) for metric in metrics},
         "shown": [m for m in metrics if m in _SHOWN.get(family, metrics)] or metrics,
         "series": [
-            {"on": name in ours, "dash": dash(variant)}
-            | _series(variant, [m for m in metrics if m in variant.metrics])
+            {"on": name in ours, "dash": dash(variant)} | _series(variant, metrics)
             for name, variant in (ours | found).items()
         ],
     }
@@ -56,7 +55,7 @@ def _series(variant: Variant, metrics: list[str]) -> dict[str, Any]:
     """A variant's curves, which all have the same points; those `far` off are cut."""
     rows, light = curves.spread_rows(variant), style.colour(variant.method)
     far, drawn = diverging(variant.metrics), {}
-    for metric in metrics:
+    for metric in (name for name in metrics if name in variant.metrics):
         values = variant.metrics[metric][:, rows]
         low, high = bootstrap_curves(values)
         q1, median, q3 = np.quantile(values, [0.25, 0.5, 0.75], axis=0)

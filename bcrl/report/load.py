@@ -8,32 +8,36 @@ import numpy as np
 
 from bcrl.common.divergence import diverging
 from bcrl.errors import BcrlError
-from bcrl.report.notes import across_methods, listed
-from bcrl.report.variants import COMPARED, Note, Runs, Variant
+from bcrl.report.variants import COMPARED, Note, Runs, Variant, across_methods, listed
 from bcrl.results.integrity import Checked, check_tree
 from bcrl.results.layout import FAILED, FQI_METRICS, INDEX, family_of, state_of
-from bcrl.results.read import BROKEN, INCOMPLETE, Finding
+from bcrl.results.read import BROKEN, INCOMPLETE
 
 LISTED = 10  # findings that an error names
 
 
 def load_runs(runs_dir: Path, scale: str, allow_incomplete: bool = False) -> Runs:
-    """Everything complete under `runs_dir`/`scale`. Raises BcrlError if there is
-    nothing, if any file there is broken or, unless `allow_incomplete`, if any requested
-    seed is not complete."""
+    """Everything complete under `runs_dir`/`scale`. BcrlError if there is nothing, if a
+    file is broken or, unless `allow_incomplete`, if a requested seed is incomplete."""
     checked, findings = check_tree(runs_dir, scale)
     rejected = [f for f in findings if f.kind == BROKEN or not allow_incomplete]
     if rejected:
-        raise BcrlError(_rejection(runs_dir / scale, rejected))
+        lines = [f"nothing is drawn, because in {runs_dir / scale}:"]
+        lines += [f"  {finding}" for finding in rejected[:LISTED]]
+        if (more := len(rejected) - LISTED) > 0:
+            shown = shlex.join(["bcrl-verify", str(runs_dir)])
+            lines.append(f"  and {more} more; `{shown}` lists all")
+        if any(finding.kind == INCOMPLETE for finding in rejected):
+            lines.append("--allow-incomplete draws what is complete, and says so")
+        raise BcrlError("\n".join(lines))
     notes: list[Note] = []
     loaded = [_variant(each, notes) for each in checked]
     runs = Runs(scale, tuple(filter(None, loaded)), notes)
     if not runs.variants:
         others = {p.parts[-4] for p in runs_dir.glob("*/*/*/seed_*.json")} - {scale}
         there = f"; there are runs at scale {listed(sorted(others))}" if others else ""
-        seen = f" ({notes[0].text})" if notes else ""
         shown = f"`{shlex.join(['bcrl', 'experiment=fig1', f'scale={scale}'])}`"
-        what = f"no complete runs under {runs_dir / scale}{seen}{there}"
+        what = f"no complete runs under {runs_dir / scale}{there}"
         raise BcrlError(f"{what}; {shown} makes those of figure 1")
     for env, family in runs.pairs:
         expected = COMPARED.get((env, family))
@@ -46,28 +50,15 @@ def load_runs(runs_dir: Path, scale: str, allow_incomplete: bool = False) -> Run
     return runs
 
 
-def _rejection(folder: Path, rejected: list[Finding]) -> str:
-    """The message for findings that are not to be overlooked."""
-    lines = [f"nothing is drawn, because in {folder}:"]
-    lines += [f"  {finding}" for finding in rejected[:LISTED]]
-    if (more := len(rejected) - LISTED) > 0:
-        shown = shlex.join(["bcrl-verify", str(folder.parent)])
-        lines.append(f"  and {more} more; `{shown}` lists all")
-    if any(finding.kind == INCOMPLETE for finding in rejected):
-        lines.append("--allow-incomplete draws what is complete and says so in figures")
-    return "\n".join(lines)
-
-
 def _variant(checked: Checked, notes: list[Note]) -> Variant | None:
     """A checked folder's seeds in arrays; None if it can't be drawn, with a note."""
     folder, documents, tables = checked.folder, checked.documents, checked.tables
     method, _, tag = folder.name.partition("@")
 
     def note(text: str, footer: str = "", incomplete: bool = False) -> None:
-        """Note something about the variant."""
         about = {"footer": footer, "method": method, "incomplete": incomplete}
-        text = f"{folder}: {text}"
-        notes.append(Note(text, folder.parent.name, tag or None, **about))
+        text, env = f"{folder}: {text}", folder.parent.name
+        notes.append(Note(text, env, tag or None, **about))
 
     failed = tuple(seed for seed, d in documents.items() if state_of(d) == FAILED)
     if checked.findings:

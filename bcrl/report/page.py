@@ -2,20 +2,23 @@
 
 import base64
 import hashlib
+import json
 import re
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from bcrl import __version__
-from bcrl.report.claims.document import claims_sections, notes_of
+from bcrl.common.identity import differences, flat, identity
+from bcrl.report.claims import claims_sections
 from bcrl.report.curve_data import curve_data
-from bcrl.report.notes import incomplete
-from bcrl.report.origins import configurations, costs, seed_origins
-from bcrl.report.tables import TEXTS, Section, TextTable, duration
-from bcrl.report.variants import Runs, env_title
+from bcrl.report.tables import ABSENT, TEXTS, Section, TextTable, duration, number
+from bcrl.report.variants import Runs, env_title, incomplete
+from bcrl.results.layout import seed_path, spelled
 
 Pair = tuple[str, str]  # environment and family
 Picture = tuple[Path, str]  # an image file and what it shows
@@ -25,29 +28,24 @@ def page(
     runs: Runs,
     tag: str | None,
     figures: Mapping[Pair, Sequence[Picture]],
-    fallback: Mapping[Pair, Sequence[Picture]],
     agents: Sequence[Picture],
     sweeps: Sequence[Section],
 ) -> str:
-    """The page of one scale's runs. `figures` are the paper's; `fallback` is for
-    browsers that can't show the interactive curves; `agents` move."""
-    notes, claims = notes_of(runs, tag), claims_sections(runs, tag)
-    return _TEMPLATES.get_template("page.html").render(
-        version=__version__,
-        runs=runs,
-        tag=tag,
+    """The page of one scale's runs. `figures` that the paper doesn't have are for
+    browsers that run no scripts; `agents` move."""
+    notes, claims = runs.notes_on(tag), claims_sections(runs, tag)
+    return _JINJA.get_template("page.html").render(
+        {"version": __version__, "texts": TEXTS, "runs": runs, "tag": tag},
         notes=notes,
         incomplete=incomplete(notes),
         facts=_facts(runs, claims),
         figures=figures,
-        fallback=fallback,
         claims=claims,
         agents=agents,
         sweeps=sweeps,
         costs=costs(runs),
         configs=configurations(runs),
         provenance=seed_origins(runs),
-        texts=TEXTS,
         curves=[curve_data(runs, env, family, tag) for env, family in runs.pairs],
     )
 
@@ -55,9 +53,8 @@ def page(
 def _facts(runs: Runs, claims: Mapping[Pair, Section]) -> dict[str, object]:
     """What the page's head says in numbers."""
     parts = [part for section in claims.values() for part in section.parts]
-    tables = [part for part in parts if isinstance(part, TextTable)]
-    found = [row.get("verdict") for table in tables for row in table.rows]
-    verdicts = list(filter(None, found))
+    rows = [row for part in parts if isinstance(part, TextTable) for row in part.rows]
+    verdicts = [row["verdict"] for row in rows if "verdict" in row]
     facts = {
         "environments": len({env for env, _ in runs.pairs}),
         "variants": len(runs.variants),
@@ -69,6 +66,84 @@ def _facts(runs: Runs, claims: Mapping[Pair, Section]) -> dict[str, object]:
         counted = f"{holds} · {fails} · {len(verdicts) - holds - fails}"
         facts["claims that hold · do not · undecided"] = counted
     return facts
+
+
+def costs(runs: Runs) -> list[str | TextTable]:
+    """CPU time and memory of each variant, and of all of an environment's."""
+    header = ("variant", "seeds", "CPU s per seed", "CPU time", "peak memory, MiB")
+    rows = []
+    for env, family in runs.pairs:
+        ours = runs.of(env, family)
+        seeds = str(sum(len(variant.seeds) for variant in ours))
+        spent = duration(sum(variant.cpu_seconds for variant in ours))
+        rows.append((f"**{env_title(env)}, {family}**", seeds, "", f"**{spent}**", ""))
+        for variant in ours:
+            n, seconds = len(variant.seeds), variant.cpu_seconds
+            peak = max(s.get("peak_memory_mib") or 0.0 for s in variant.sidecars)
+            cells = (variant.name, str(n), number(seconds / n), duration(seconds))
+            rows.append((*cells, f"{peak:.0f}" if peak else ABSENT))
+    table = TextTable([dict(zip(header, row, strict=True)) for row in rows])
+    return [TEXTS["costs"], table]
+
+
+def configurations(runs: Runs) -> list[dict[str, Any]]:
+    """Each variant's settings: key, value, and its environment's first if different."""
+    groups = []
+    for env, family in runs.pairs:
+        reference, *_ = ours = runs.of(env, family)
+        other, found = reference.sidecars[0]["config"], []
+        for variant in ours:
+            config = variant.sidecars[0]["config"]
+            settings, differing = flat(identity(config)), differences(config, other)
+            settings |= {key: mine for key, (mine, _) in differing.items()}
+            theirs = {key: _text(value) for key, (_, value) in differing.items()}
+            lines = [(k, _text(v), theirs.get(k)) for k, v in settings.items()]
+            commands = dict.fromkeys(s.get("command") for s in variant.sidecars)
+            differ = f", {len(differing)} differ" if differing else ""
+            about = {"name": variant.name, "summary": f"{len(lines)} settings{differ}"}
+            about |= {"command": "\n".join(filter(None, commands)), "lines": lines}
+            found.append(about)
+        title = f"{env_title(env)}, {family}"
+        groups.append({"title": title, "reference": reference.name, "variants": found})
+    return groups
+
+
+def _text(value: object) -> str:
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+def seed_origins(runs: Runs) -> list[str | TextTable]:
+    """Which code, libraries and machine made which seeds, and when."""
+    made: dict[tuple[str, ...], dict[Path, list[int]]] = {}
+    for variant in runs.variants:
+        for seed, sidecar in zip(variant.seeds, variant.sidecars, strict=True):
+            group = made.setdefault(_origin(sidecar), {})
+            group.setdefault(variant.folder, []).append(seed)
+    rows = []
+    for (revision, versions, machine), group in made.items():
+        who = [f"{v.parent.name} {v.name} {spelled(s)}" for v, s in group.items()]
+        # A seed's JSON is written last.
+        paths = [seed_path(v, seed, "json") for v, s in group.items() for seed in s]
+        dates = sorted(datetime.fromtimestamp(p.stat().st_mtime, UTC) for p in paths)
+        when = f"{dates[0]:%Y-%m-%d %H:%M} – {dates[-1]:%Y-%m-%d %H:%M} UTC"
+        row = {"seeds": ", ".join(who), "revision": revision, "versions": versions}
+        rows.append(row | {"machine": machine, "finished (files' dates)": when})
+    return [TextTable(rows)]
+
+
+def _origin(sidecar: dict[str, Any]) -> tuple[str, ...]:
+    """Revision, versions and machine as text; a dash for what isn't recorded."""
+    git, machine = sidecar.get("git") or {}, dict(sidecar.get("machine") or {})
+    revision = str(git.get("revision") or ABSENT)[:10]
+    changed = " with changes" if git.get("dirty") else ""
+    versions = (sidecar.get("versions") or {}).items()
+    cores = machine.pop("cores", None)
+    where = [*machine.values(), cores and f"{cores} cores", sidecar.get("device")]
+    return (
+        f"`{revision}`{changed}",
+        ", ".join(f"{name} {version}" for name, version in versions) or ABSENT,
+        " · ".join(map(str, filter(None, where))) or ABSENT,
+    )
 
 
 def _url(image: Path) -> str:
@@ -89,14 +164,9 @@ def _sha256(text: str) -> str:
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
-_TEMPLATES = Environment(  # escapes whatever is no `Markup`
-    loader=PackageLoader("bcrl.report"),
-    autoescape=True,
-    undefined=StrictUndefined,
-    trim_blocks=True,
-    lstrip_blocks=True,
-)
+_BLOCKS = {"undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+_JINJA = Environment(loader=PackageLoader("bcrl.report"), autoescape=True, **_BLOCKS)
 _STRICT = {"separators": (",", ":"), "allow_nan": False, "ensure_ascii": False}
-_TEMPLATES.policies["json.dumps_kwargs"] = _STRICT
-_TEMPLATES.filters |= {"prose": _prose, "url": _url, "sha256": _sha256}
-_TEMPLATES.filters["env_title"] = env_title
+_JINJA.policies["json.dumps_kwargs"] = _STRICT
+_JINJA.filters |= {"prose": _prose, "url": _url, "sha256": _sha256}
+_JINJA.filters["env_title"] = env_title

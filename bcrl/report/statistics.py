@@ -11,8 +11,7 @@ _RESAMPLES = 10_000
 LEVEL = 0.95
 MOST_DRAWS = 4_000_000  # resampled seeds that are held in memory at a time
 _SEED = 20_220_425  # every interval draws from its own generator, started from this
-#: Below this a percentile bootstrap is far too narrow: no verdict is given.
-FEWEST_SEEDS = 5
+FEWEST_SEEDS = 5  # for a verdict: the bootstrap of fewer is far too narrow
 Interval = tuple[float, float]  # closed; both ends are nan where the data allow none
 
 
@@ -27,10 +26,9 @@ def standard_error(values: np.ndarray, ddof: int = 0) -> np.ndarray:
 def bootstrap(
     *samples: ArrayLike, statistic: Callable[..., np.ndarray] = np.mean
 ) -> Interval:
-    """95 % percentile bootstrap interval of a statistic of (S,) independent seeds. With
-    two samples: of the difference of their statistics. They are resampled
-    independently: seeds are not paired across methods. nan for fewer than two seeds and
-    for non-finite values (Efron and Tibshirani 1993, chapter 13)."""
+    """95 % percentile bootstrap interval of a statistic of (S,) seeds or of two groups'
+    difference, resampled independently: seeds aren't paired across methods. nan for one
+    seed and non-finite values (Efron and Tibshirani 1993, chapter 13)."""
     given = [np.asarray(sample, float) for sample in samples]
     if not all(len(sample) > 1 and np.isfinite(sample).all() for sample in given):
         return math.nan, math.nan
@@ -39,26 +37,16 @@ def bootstrap(
         first, *rest = (statistic(each, axis=axis) for each in drawn)
         return first - rest[0] if rest else first
 
-    found = stats.bootstrap(
-        given,
-        of,
-        n_resamples=_RESAMPLES,
-        batch=max(1, MOST_DRAWS // max(map(len, given))),
-        vectorized=True,
-        confidence_level=LEVEL,
-        method="percentile",
-        rng=np.random.default_rng(_SEED),
-    )
-    low, high = found.confidence_interval
+    options = {"confidence_level": LEVEL, "method": "percentile", "vectorized": True}
+    options["batch"] = max(1, MOST_DRAWS // max(map(len, given)))
+    options |= {"n_resamples": _RESAMPLES, "rng": np.random.default_rng(_SEED)}
+    low, high = stats.bootstrap(given, of, **options).confidence_interval
     return float(low), float(high)
 
 
-def bootstrap_curves(
-    values: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+def bootstrap_curves(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """`bootstrap` of the mean at every point of (S, I) curves: both ends, (I,) each.
-    One draw of the seeds serves all points; SciPy's bootstrap takes four times as
-    long."""
+    One draw of the seeds serves all points: four times as fast as SciPy's."""
     n = len(values)
     if n < 2:
         return np.full((2, values.shape[1]), math.nan)
@@ -74,8 +62,7 @@ def bootstrap_curves(
 
 
 def share_interval(successes: int, n: int) -> Interval:
-    """95 % Wilson score interval of a share. Used for shares of seeds, where the
-    bootstrap of 0 of n has no width (Wilson 1927)."""
+    """95 % score interval of a share (Wilson 1927); a bootstrap of 0 has no width."""
     found = stats.binomtest(successes, n).proportion_ci(LEVEL, method="wilson")
     return float(found.low), float(found.high)
 

@@ -1,5 +1,6 @@
-"""Tables of text, cells with intervals, and the long-form aggregate over seeds."""
+"""Tables of text, the aggregate over seeds, and variants of a method compared."""
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -7,19 +8,17 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 import yaml
-from scipy import stats
 
+from bcrl.common.identity import flat, identity
 from bcrl.report.statistics import FEWEST_SEEDS, Interval, bootstrap, standard_error
-from bcrl.report.variants import WINDOW, Runs
-from bcrl.results.layout import INDEX
+from bcrl.report.variants import WINDOW, Runs, Variant
+from bcrl.results.layout import INDEX, spelled
 
 ABSENT = "–"  # a cell without a value
-_TEXTS = Path(__file__).with_name("templates") / "texts.yaml"
-#: Paragraphs of the documents and the page, by name.
-TEXTS = {
-    name: text.format(fewest=FEWEST_SEEDS, window=WINDOW)
-    for name, text in yaml.safe_load(_TEXTS.read_text("utf-8")).items()
-}
+_PATH = Path(__file__).with_name("templates") / "texts.yaml"
+_TEXT = _PATH.read_text("utf-8").format(fewest=FEWEST_SEEDS, window=WINDOW)
+TEXTS = yaml.safe_load(_TEXT)  # paragraphs of the documents and the page, by name
+_DECISIVE = {"FQI": "last_return", "DQN": "late_return"}  # means that rank variants
 
 
 class TextTable(NamedTuple):
@@ -58,16 +57,6 @@ def estimate(value: float, interval: Interval) -> str:
     return f"{number(value)} [{number(interval[0])}, {number(interval[1])}]"
 
 
-def mean_cell(values: np.ndarray) -> str:
-    """Mean of (S,) values over seeds with its interval."""
-    return estimate(values.mean(), bootstrap(values))
-
-
-def interquartile_mean(values: np.ndarray) -> str:
-    """Mean of (S,) values without the lowest and the highest ⌊S/4⌋ of them."""
-    return number(stats.trim_mean(values, 0.25))
-
-
 def duration(seconds: float) -> str:
     """`1.5 h`, `12 s`."""
     return f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
@@ -79,25 +68,88 @@ def seeds_cell(complete: int, failed: int) -> str:
 
 
 def aggregate(runs: Runs, family: str = "FQI") -> pd.DataFrame:
-    """Mean and standard error over seeds of every metric at every evaluation. One row
-    per (variant, iteration or step, metric), tagged variants included. A mean over a
-    non-finite value is empty, as is the standard error (ddof = 1) of one seed."""
+    """Mean and standard error (ddof = 1) over seeds, empty where not finite: a row for
+    each variant, tagged ones included, iteration or step, and metric."""
     *_, counter = INDEX[family]
-    blocks = [
-        {
-            "scale": runs.scale,
-            "env": variant.env,
-            "variant": variant.name,
-            "stage": variant.stage,
-            "task": variant.task,
-            counter: variant.index,
-            "metric": metric,
-            "seeds": len(variant.seeds),
-            "mean": values.mean(axis=0),
-            "standard_error": standard_error(values, ddof=1),
-        }
-        for variant in runs.variants
-        if variant.family == family
-        for metric, values in variant.metrics.items()
-    ]
-    return pd.concat(map(pd.DataFrame, blocks), ignore_index=True)
+    blocks = []
+    for variant in (v for v in runs.variants if v.family == family):
+        index = {"scale": runs.scale, "env": variant.env, "variant": variant.name}
+        index |= {"stage": variant.stage, "task": variant.task, counter: variant.index}
+        for metric, values in variant.metrics.items():
+            block = index | {"metric": metric, "seeds": len(variant.seeds)}
+            block["mean"] = values.mean(axis=0)
+            block["standard_error"] = standard_error(values, ddof=1)
+            blocks.append(pd.DataFrame(block))
+    return pd.concat(blocks, ignore_index=True)
+
+
+def sweep_table(runs: Runs) -> pd.DataFrame:
+    """One row per variant of the methods that have more than one: settings as JSON,
+    seeds, late and last return and success rate (nan if FQI lacks it), intervals."""
+    together: dict[tuple[str, str], list[Variant]] = {}
+    for variant in runs.variants:
+        together.setdefault((variant.env, variant.method), []).append(variant)
+    rows, decisive = [], []
+    for variants in (group for group in together.values() if len(group) > 1):
+        texts = pd.DataFrame([_texts(variant) for variant in variants])
+        differing = texts.loc[:, texts.nunique(dropna=False) > 1].fillna(ABSENT)
+        chosen = differing.T.to_dict().values()
+        for variant, settings in zip(variants, chosen, strict=True):
+            row: dict[str, object] = {"env": variant.env, "method": variant.method}
+            text = json.dumps(settings, ensure_ascii=False)
+            row |= {"variant": variant.name, "settings": text}
+            n, failed = len(variant.seeds), len(variant.failed)
+            row |= {"seeds": spelled(variant.seeds), "complete": n, "failed": failed}
+            for name, values in _measured(variant).items():
+                low, high = bootstrap(values)
+                row |= {name: values.mean(), f"{name}_low": low, f"{name}_high": high}
+            rows.append(row)
+            decisive.append(row[_DECISIVE[variant.family]])
+    table = pd.DataFrame(rows)
+    if rows:
+        groups = pd.Series(decisive).groupby([table["env"], table["method"]])
+        table["best"] = groups.rank(ascending=False, method="first") == 1
+    return table
+
+
+def _texts(variant: Variant) -> dict[str, str]:
+    """Dotted keys of a variant's config → values as JSON, strings without quotes."""
+    config = identity(variant.sidecars[0]["config"])
+    kept = flat({k: v for k, v in config.items() if k != "scale"})
+    return {k: json.dumps(v, ensure_ascii=False).strip('"') for k, v in kept.items()}
+
+
+def _measured(variant: Variant) -> dict[str, np.ndarray]:
+    """Late and last return and success rate, (S,) each; nan for what FQI lacks."""
+    names, nothing = ("return", "solved"), np.array([[np.nan]])
+    last, success = (variant.metrics.get(name, nothing)[:, -1] for name in names)
+    late = nothing
+    if variant.family == "DQN":
+        late, success = variant.late("return"), variant.late("success_rate")
+    return {"late_return": late, "last_return": last, "success_rate": success}
+
+
+def sweep_sections(table: pd.DataFrame) -> list[Section]:
+    """Per method: how many variants, which is best, and a table of all."""
+    found = []
+    groups = table.groupby(["env", "method"], sort=False) if len(table) else ()
+    for (env, method), group in groups:
+        same = group["seeds"].nunique() == 1
+        used = f"Seeds {group['seeds'].iloc[0]}." if same else "Seeds differ by row."
+        text, rows = f"{len(group)} variants. {used}", []
+        for row in group.to_dict("records"):
+            settings = json.loads(row["settings"])
+            seeds = f"{row['seeds']} · {seeds_cell(row['complete'], row['failed'])}"
+            cells = {"variant": row["variant"], **settings, "seeds · number": seeds}
+            for name in ("late_return", "last_return", "success_rate"):
+                interval = row[f"{name}_low"], row[f"{name}_high"]
+                cells[name.replace("_", " ")] = estimate(row[name], interval)
+            if row["best"]:
+                fqi = np.isnan(row["late_return"])
+                decisive = "last return" if fqi else "late return"
+                cells[decisive] = f"**{cells[decisive]}**"
+                chosen = ", ".join(f"{key} = {v}" for key, v in settings.items())
+                text += f" Best: {row['variant']}{f' ({chosen})' if chosen else ''}."
+            rows.append(cells)
+        found.append(Section(f"{env}: {method}", [f"{text}\n", TextTable(rows)]))
+    return found

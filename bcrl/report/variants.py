@@ -1,24 +1,21 @@
-"""What is reported on: a variant's seeds as arrays, and the variants of a scale."""
+"""What is reported on: variants' seeds as arrays, and what is odd about them."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bcrl.results.layout import seed_path
+from bcrl.results.layout import seed_path, spelled
 from bcrl.results.read import read_arrays
 
 LINEAR = "linear_system"
 WINDOW = 5000  # environment steps before a run's end whose evaluations are averaged
 #: The methods of each family, in the order of the legends.
 METHODS = ("FQI", "C-FQI", "B-FQI", "BC-FQI")
-DQN_METHODS = (
-    *("DQN", "C-DQN", "B-DQN", "BC-DQN", "S-DQN", "SC-DQN", "SB-DQN", "SBC-DQN"),
-    *("RPL", "PPR"),
-)
-FAMILIES = {"FQI": METHODS, "DQN": DQN_METHODS}
+_DQN = "DQN C-DQN B-DQN BC-DQN S-DQN SC-DQN SB-DQN SBC-DQN RPL PPR"
+FAMILIES = {"FQI": METHODS, "DQN": tuple(_DQN.split())}
 #: The methods that the paper's figures compare: what is absent of them gets a note.
 COMPARED = {
     ("car_on_hill", "FQI"): METHODS,
@@ -32,11 +29,9 @@ Methods = Mapping[str, "Variant"]  # by the name of the method
 
 @dataclass(frozen=True)
 class Note:
-    """One diagnostic: `text` for the terminal, `footer` (if any) for the figures.
-
-    It concerns figures of `env` with variants tagged `tag`: those that draw `method`
-    or, without a method, compare those of `family`. `incomplete`: it counts seeds.
-    """
+    """One diagnostic: `text` for the terminal, `footer` (if any) for figures of `env`
+    with variants tagged `tag`: those that draw `method` or, without a method, compare
+    those of `family`. `incomplete`: it counts seeds."""
 
     text: str
     env: str
@@ -50,12 +45,10 @@ class Note:
 @dataclass(eq=False)
 class Variant:
     """All complete seeds of one variant: S seeds, I rows (evaluations) common to them.
-
     `stage` and `task` (I,) are 1-based; `index` (I,) counts the iterations or, in the
     DQN family, the environment steps of all stages so far; `metrics` are (S, I);
     `sidecars` are the seeds' JSONs; `failed` are seeds that diverged and are left out.
-    The folder's `name` is the `method` and perhaps its `tag`: `BC-FQI@released`.
-    """
+    The folder's `name` is the `method` and perhaps its `tag`: `BC-FQI@released`."""
 
     folder: Path
     family: str
@@ -146,7 +139,78 @@ class Runs:
         found = self.methods(env, tag, family)
         return {n: v for n, v in found.items() if n in COMPARED[env, family]}
 
+    def notes_on(self, tag: str | None) -> list[Note]:
+        """The notes for a document about the variants `tag` and those that stand in."""
+        linear = self.methods(LINEAR, tag, "DQN").values()
+        drawn = {(v.env, v.method, v.tag) for v in linear}
+        found = ((note, (note.env, note.method, note.tag)) for note in self.notes)
+        return [note for note, about in found if note.tag == tag or about in drawn]
+
 
 def env_title(env: str) -> str:
     """An environment's name as a title, `Mountain car`."""
     return _TITLES.get(env, env.replace("_", " ").capitalize())
+
+
+def listed(items: Iterable[object]) -> str:
+    """`a, b and c`."""
+    *head, last = map(str, items)
+    return f"{', '.join(head)} and {last}" if head else last
+
+
+def tags_shown(methods: Methods) -> str:
+    """`variants @released`, or whose: `@released: BC-DQN, SC-DQN`."""
+    tagged = {name: v.tag for name, v in methods.items() if v.tag}
+    (tag,) = set(tagged.values()) or {""}
+    if len(tagged) in (0, len(methods)):
+        return f"variants @{tag}" if tag else ""
+    return f"@{tag}: {', '.join(tagged)}"
+
+
+def remarks(runs: Runs, methods: Methods, compares: bool = True) -> list[str]:
+    """The lines that belong under a figure of `methods`, which may be of several tags.
+    `compares`: differences between methods belong to it too."""
+    env, family = next((v.env, v.family) for v in methods.values())
+    tags = {v.tag for v in methods.values()}
+
+    def belongs(note: Note) -> bool:
+        if note.method in methods and methods[note.method].tag == note.tag:
+            return True
+        if note.method:  # it isn't drawn: perhaps it has no complete seed
+            awaited = note.method in COMPARED.get((env, family), ())
+            return compares and note.incomplete and awaited and note.tag in tags
+        return compares and note.family == family and {note.tag} == tags
+
+    shown = [note for note in runs.notes if note.env == env and belongs(note)]
+    if compares and len(tags) > 1:  # no notes were made for such a mixture yet
+        shown += across_methods(methods, methods, env, None, family)
+    odd = [note.footer for note in shown if note.footer and not note.incomplete]
+    lines = [incomplete(shown), f"Note: {'; '.join(odd)}" if odd else ""]
+    return list(filter(None, lines))
+
+
+def incomplete(notes: Iterable[Note]) -> str:
+    """`INCOMPLETE: BC-FQI 3 of 20 seeds`; empty if nothing is."""
+    counts = [note.footer for note in notes if note.incomplete]
+    return f"INCOMPLETE: {', '.join(counts)}" if counts else ""
+
+
+def across_methods(
+    methods: Methods, expected: Iterable[str], env: str, tag: str | None, family: str
+) -> list[Note]:
+    """Notes on compared methods that are absent or that differ in seeds or length. In
+    the DQN family lengths differ by design and aren't compared."""
+    variants, suffix = methods.values(), f"@{tag}" if tag else ""
+    absent = [f"{name}{suffix}" for name in expected if name not in methods]
+    found = [f"no runs of {listed(absent)}"] if absent else []
+    compared = {"seeds": lambda v: spelled(v.seeds), "optima": lambda v: v.optimum}
+    if family == "FQI":
+        compared["iterations"] = lambda v: len(v.stage)
+    for what, value_of in compared.items():
+        groups: dict[object, list[str]] = {}
+        for variant in variants:
+            groups.setdefault(value_of(variant), []).append(variant.name)
+        if len(groups.keys() - {None}) > 1:
+            texts = [f"{value}: {listed(names)}" for value, names in groups.items()]
+            found.append(f"{what} differ: {'; '.join(texts)}")
+    return [Note(f"{env}: {text}", env, tag, text, family=family) for text in found]

@@ -21,16 +21,13 @@ _NAME = re.compile(rf"{layout.SEED}([0-9]+)\.({'|'.join(layout.SUFFIXES)})")
 
 
 class Checked(NamedTuple):
-    """A variant's folder: the findings in it, and what is sound.
-
-    JSONs by seed; CSVs of the complete seeds; the seeds that were to be made so far.
-    """
+    """A variant's folder: what is wrong, JSONs by seed, CSVs of the complete seeds."""
 
     folder: Path
     findings: list[Finding]
     documents: dict[int, Document]
     tables: dict[int, pd.DataFrame]
-    requested: set[int]
+    requested: set[int]  # the seeds that were to be made so far
 
 
 def check_tree(
@@ -87,21 +84,18 @@ def check_folder(folder: Path) -> Checked:
     findings += [*_config_findings(folder, documents), *_index_findings(folder, tables)]
     for seed, document in documents.items():
         if state_of(document) != layout.COMPLETE:
-            what = f'says "{document["status"]}"'
+            path, what = seed_path(folder, seed, "json"), f'says "{document["status"]}"'
             remedy = f"wait if it is being computed, else {AGAIN}"
-            path = seed_path(folder, seed, "json")
             findings.append(Finding(path, what, remedy, INCOMPLETE))
     asked = set().union(*map(requested, documents.values()))
     if missing := sorted(asked - numbers):
         made = (d for d in documents.values() if missing[0] in requested(d))
         typed = next(filter(None, (d.get("command") for d in made)), "")
-        what = f"lacks seed{'s' * (len(missing) > 1)} {layout.spelled(missing)}"
-        remedy = AGAIN + (f" (`{typed}`)" if typed else "")
-        what += ", which a command was to make"
+        what = f"lacks seeds {layout.spelled(missing)}, which a command was to make"
+        remedy = f"{AGAIN}{f' (`{typed}`)' if typed else ''}"
         findings.append(Finding(folder, what, remedy, INCOMPLETE))
     if not numbers:
-        remedy = f"{AGAIN}, or move the folder away"
-        findings.append(Finding(folder, "has no seeds", remedy, INCOMPLETE))
+        findings.append(Finding(folder, "has no seeds", AGAIN, INCOMPLETE))
     return Checked(folder, findings, documents, tables, asked)
 
 
@@ -114,22 +108,17 @@ def _config_findings(folder: Path, documents: dict[int, Document]) -> Iterator[F
         configs[path] = yaml.safe_load(path.read_bytes())
         # As text, which tells 1 from 1.0 and from true.
         texts = {p: json.dumps(identity(c), sort_keys=True) for p, c in configs.items()}
-    except FileNotFoundError:
-        yield Finding(path, "is missing", anew)
-        return
     except Exception as error:  # PyYAML raises what its constructors happen to
-        yield Finding(path, f"is not a readable config ({type(error).__name__})", anew)
+        why = type(error).__name__
+        what = f"is not a readable config ({why})" if path.exists() else "is missing"
+        yield Finding(path, what, anew)
         return
-    model, odd = _odd(texts)
-    for each in odd:
+    for each, model in _odd(texts):
         found = differences(configs[model], configs[each]).items()
         shown = [f"{key}: there {a!r}, here {b!r}" for key, (a, b) in found]
-        if (more := len(shown) - _SHOWN_KEYS) > 0:
-            shown[_SHOWN_KEYS:] = [f"and {more} more"]
-        changed = "; ".join(shown) or "types of values"
+        changed = "; ".join(shown[:_SHOWN_KEYS]) or "types of values"
         what = f"has another config than {model.name} ({changed})"
-        remedy = f"delete {each.with_suffix('.*')} and {AGAIN}"
-        yield Finding(each, what, anew if each == path else remedy)
+        yield Finding(each, what, anew if each == path else "")
 
 
 def _index_findings(folder: Path, tables: dict[int, pd.DataFrame]) -> Iterator[Finding]:
@@ -139,21 +128,17 @@ def _index_findings(folder: Path, tables: dict[int, pd.DataFrame]) -> Iterator[F
         for seed, table in tables.items()
     }
     keys = {p: (*t.columns, t.to_numpy().tobytes()) for p, t in index.items()}
-    model, odd = _odd(keys) if keys else (folder, [])
-    for path in odd:
+    for path, model in _odd(keys):
         mine, theirs = index[path], index[model]
         names = [str(c) for c in theirs if list(mine.get(c, ())) != list(theirs[c])]
-        where = f"{' and '.join(names)} column{'s' * (len(names) > 1)}"
-        if len(mine) != len(theirs):
-            where = f"length ({len(mine)} rows, not {len(theirs)})"
-        what = f"differs from {model.name} in its {where}"
-        mixed = ", so the folder mixes two configurations or versions"
-        remedy = f"delete {path.with_suffix('.*')} and {AGAIN}"
-        yield Finding(path, what + mixed, remedy)
+        sizes = f"{len(mine)} rows, not {len(theirs)}"
+        where = ", ".join(names) if len(mine) == len(theirs) else sizes
+        what = f"has another index than {model.name} ({where})"
+        yield Finding(path, f"{what}: configurations or versions are mixed")
 
 
-def _odd(keys: Mapping[Path, Any]) -> tuple[Path, list[Path]]:
-    """The first of the files that are as most are, and those that are not."""
+def _odd(keys: Mapping[Path, Any]) -> list[tuple[Path, Path]]:
+    """The files that are not as most are, each with the first of those."""
     counts = Counter(keys.values())
-    model = max(keys, key=lambda path: counts[keys[path]])
-    return model, [path for path in keys if keys[path] != keys[model]]
+    ranked = sorted(keys, key=lambda path: -counts[keys[path]])
+    return [(path, ranked[0]) for path in keys if keys[path] != keys[ranked[0]]]

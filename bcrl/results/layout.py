@@ -24,8 +24,7 @@ COMPLETE, RUNNING, FAILED = "complete", "running", "failed"
 #: rows: iterations of the whole run, or environment steps of all stages so far.
 INDEX = {"FQI": ("stage", "task", "iteration"), "DQN": ("stage", "task", "step")}
 
-#: The columns after the index in FQI's CSVs of the paper's environments. In another
-#: environment they are the config's `env.metrics`.
+#: The columns after the index in FQI's CSVs; in other environments `env.metrics`.
 FQI_METRICS = {
     "car_on_hill": ("q_error", "return"),
     "maze": ("return", "q_error_start", "q_error", "residual_start", "solved"),
@@ -36,8 +35,7 @@ DQN_METRICS = (
     *("return", "discounted_return", "success_rate", "q_mean", "loss"),
     *("greedy_return", "greedy_discounted_return", "greedy_success_rate"),
 )
-#: Those of them that are nan where there was nothing to average.
-MAY_BE_NAN = ("q_mean", "loss")
+MAY_BE_NAN = ("q_mean", "loss")  # those with nothing to average at times
 
 
 def seed_name(seed: int) -> str:

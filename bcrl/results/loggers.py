@@ -2,10 +2,10 @@
 
 import importlib.util
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -19,8 +19,8 @@ Row = Mapping[str, float]
 Log = Callable[[str, Sequence[Sequence[Row]]], None]
 
 
-class Writer(Protocol):
-    """Where one seed's rows go: all again if a run resumes after an interruption."""
+class Writer:
+    """Takes one seed's rows, all again if a run resumes; this one drops them."""
 
     def write(self, count: int, row: Row) -> None:
         """A row of the seed's CSV, by its count of iterations or steps."""
@@ -29,30 +29,18 @@ class Writer(Protocol):
         """Nothing more will come from this process."""
 
 
-class Logger(Protocol):
-    """A frozen dataclass; its fields are the YAML's keys besides `name`.
-
-    Made before work starts, it raises ConfigError if it can't do its work.
-    """
+@dataclass(frozen=True)
+class Logger:
+    """Logs nothing. The fields of others are the YAML's keys besides `name`; made
+    before work starts, they raise ConfigError if they can't do their work."""
 
     def open(self, runs_dir: Path, run: str) -> Writer:
         """A writer for `run`, such as "quick/maze/BC-FQI/seed_0007"."""
+        return Writer()
 
 
 @dataclass(frozen=True)
-class Nothing:
-    """Logs nothing."""
-
-    def open(self, runs_dir: Path, run: str) -> Writer:
-        return self
-
-    def write(self, count: int, row: Row) -> None: ...
-
-    def close(self) -> None: ...
-
-
-@dataclass(frozen=True)
-class TensorBoard:
+class TensorBoard(Logger):
     """Event files in `<runs_dir>/.tensorboard`, one folder per seed."""
 
     def __post_init__(self) -> None:
@@ -64,23 +52,22 @@ class TensorBoard:
         return _Events(runs_dir / LOGS / run)
 
 
-class _Events:
-    """One seed's event file."""
-
+class _Events(Writer):
     def __init__(self, folder: Path) -> None:
         from torch.utils.tensorboard import SummaryWriter  # slow to import
 
-        # Whatever an interrupted process has logged gives way to what comes.
-        self._events = SummaryWriter(folder, purge_step=0)
-        self.close = self._events.close
+        self._events = SummaryWriter(folder, purge_step=0)  # a resumed run logs anew
 
     def write(self, count: int, row: Row) -> None:
         for name, value in row.items():
             if np.isfinite(value):
                 self._events.add_scalar(name, value, count)
 
+    def close(self) -> None:
+        self._events.close()
 
-LOGGERS: dict[str, type] = {"none": Nothing, "tensorboard": TensorBoard}
+
+LOGGERS: dict[str, type] = {"none": Logger, "tensorboard": TensorBoard}
 
 
 def logger(section: Any) -> Logger:
@@ -104,9 +91,8 @@ def opened(
     made, root = logger(config["logger"]), Path(config["runs_dir"])
     folder = directory.relative_to(root).as_posix()
     with ExitStack() as stack:
-        writers = [made.open(root, f"{folder}/{seed_name(seed)}") for seed in seeds]
-        for writer in writers:
-            stack.callback(writer.close)
+        opening = (made.open(root, f"{folder}/{seed_name(seed)}") for seed in seeds)
+        writers = [stack.enter_context(closing(writer)) for writer in opening]
 
         def log(index: str, rows: Sequence[Sequence[Row]]) -> None:
             for writer, added in zip(writers, rows, strict=True):

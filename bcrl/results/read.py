@@ -2,7 +2,6 @@
 
 import io
 import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,10 +22,8 @@ Document = dict[str, Any]  # a seed's JSON
 
 @dataclass(eq=False)
 class Finding(BcrlError):
-    """A file or folder that is not as a finished run leaves it, and what to do.
-
-    Raised where such a file is read. By default the remedy is to make the seed anew.
-    """
+    """A file or folder that is not as a finished run leaves it, and what to do; by
+    default that is to make the seed anew. Raised where such a file is read."""
 
     path: Path
     what: str
@@ -44,13 +41,11 @@ def read_document(folder: Path, seed: int) -> Document:
     """A seed's JSON; Finding unless it is whole, unchanged and in its place."""
     path = layout.seed_path(folder, seed, "json")
     try:
-        document = json.loads(_bytes(path))
-        intact = is_intact(document)
+        intact = is_intact(document := json.loads(_bytes(path)))
     except (ValueError, RecursionError, AttributeError) as error:
         raise Finding(path, "is not a readable JSON object") from error
     if (schema := document.get("schema")) != layout.SCHEMA:
-        what = f"has schema {schema!r}, this version reads {layout.SCHEMA}"
-        raise Finding(path, what)
+        raise Finding(path, f"has schema {schema!r}, not {layout.SCHEMA}")
     if not intact:
         raise Finding(path, "was changed after it was written (see its digest)")
     for key, value in layout.belongs_to(folder, seed).items():
@@ -125,21 +120,16 @@ def read_arrays(path: Path, *names: str) -> list[NDArray[Any]]:
     try:
         with np.load(path, allow_pickle=False) as stored:
             return [stored[name] for name in names]
-    except FileNotFoundError as error:
-        raise Finding(path, "is missing") from error
     except KeyError as error:
-        what = f"does not hold what is needed ({error.args[0]})"
-        raise Finding(path, what) from error
-    except (OSError, EOFError, ValueError, TypeError, zipfile.BadZipFile) as error:
+        raise Finding(path, f"lacks what is needed ({error.args[0]})") from error
+    except Exception as error:  # whatever NumPy's readers raise
         raise Finding(path, "is not a readable NPZ") from error
 
 
 def read_folder(folder: str | Path) -> pd.DataFrame:
-    """The CSVs of all seeds in a variant's folder, unchecked, below a column `seed`.
-    BcrlError if there are none."""
+    """All CSVs in a variant's folder, unchecked, with a column `seed`, or BcrlError."""
     numbers = layout.recorded_seeds(Path(folder), "csv")
     if not numbers:
         raise BcrlError(f"{folder}: there is no seed_*.csv")
     found = {n: pd.read_csv(layout.seed_path(Path(folder), n, "csv")) for n in numbers}
-    together = pd.concat(found, names=["seed"])
-    return together.reset_index("seed").reset_index(drop=True)
+    return pd.concat(found, names=["seed"]).reset_index("seed").reset_index(drop=True)

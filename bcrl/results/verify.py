@@ -11,11 +11,8 @@ from bcrl.results.arguments import ResultsParser
 from bcrl.results.integrity import check_tree
 from bcrl.results.read import BROKEN
 
-_ABOUT = """\
-Check every result file of a folder: hashes, places, configs, order, missing seeds. Exit
-code: 0 nothing wrong, 1 some runs are incomplete, 2 something is broken or there are no
-runs.
-"""
+_ABOUT = """Check every result file of a folder: hashes, places, configs, order, missing
+seeds. Exit code: 0 nothing wrong, 1 runs are incomplete, 2 broken, or no runs."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -36,8 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         why = "holds no runs" if runs_dir.is_dir() else "is not a folder"
         say(f"bcrl-verify: {runs_dir} {why}; name a runs_dir")
         return 2
-    done = {"variant": len(variants), "seed": sum(len(v.tables) for v in variants)}
-    shown = ", ".join(f"{n} {noun}{'s' * (n != 1)}" for noun, n in done.items())
+    shown = f"{len(variants)} variants, {sum(len(v.tables) for v in variants)} seeds"
     counts = Counter(finding.kind for finding in findings)
     wrong = ", ".join(f"{n} {kind}" for kind, n in counts.items()) or "nothing wrong"
     show(f"{shown} complete; {wrong}")

@@ -11,19 +11,14 @@ from bcrl.report.variants import COMPARED, METHODS
 from bcrl.results.layout import DQN_METRICS, seed_path
 from tests.results.made_up import made_up_plan, write_seeds
 
-#: Iterations of each stage: the paper's, and few.
-LENGTHS = {"maze": (10, 10, 10, 10, 20, 20, 50, 50, 50, 50)}
-SHORT = {"car_on_hill": (3, 3, 3), "maze": (2,) * 10}
+SHORT = {"car_on_hill": (3, 3, 3), "maze": (2,) * 10}  # iterations of each stage
 OPTIMUM = -47.557563488
 LATTICE = np.array([(x, y) for x in range(21) for y in range(21)]) / 20
 
 SEVEN = COMPARED["linear_system", "DQN"]
 LEVEL = {"DQN": -100, "C-DQN": -120, "BC-DQN": -80, "SC-DQN": -60, "SBC-DQN": -45}
 LEVEL |= {"RPL": -110, "PPR": -105, "S-DQN": -100}
-ACTIONS = np.array(
-    [(1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)], float
-)
-ACTIONS /= np.linalg.norm(ACTIONS, axis=1, keepdims=True)
+ACTIONS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], float)
 PLANE = np.array([(x, 0, y, 0) for x in range(-20, 21) for y in range(-20, 21)]) / 4
 
 
@@ -40,10 +35,7 @@ def verdicts_of(document: str, section: str) -> dict[str, str]:
     return {cells[0]: cells[-1] for cells in rows}
 
 
-# --- car on the hill and maze
-
-
-def as_the_paper_says(env, method, seed, stage):
+def as_claimed(env, method, seed, stage):
     """Curves with which every claim is true, with a little spread between seeds."""
     jitter = 0.001 * seed
     first = np.concatenate([[True], np.diff(stage) > 0])
@@ -72,7 +64,7 @@ def as_the_paper_says(env, method, seed, stage):
 def the_opposite(env, method, seed, stage):
     """The same with BC-FQI's and FQI's curves exchanged, and C-FQI's and B-FQI's."""
     other = dict(zip(METHODS, METHODS[::-1], strict=True))
-    curves = as_the_paper_says(env, other[method], seed, stage)
+    curves = as_claimed(env, other[method], seed, stage)
     if env == "maze":
         curves["residual_start"] = curves["residual_start"][::-1]
     return curves
@@ -81,28 +73,15 @@ def the_opposite(env, method, seed, stage):
 def maze_arrays(seed: int) -> dict[str, np.ndarray]:
     path = np.linspace(0, 0.95, 20 + seed % 8)[:, None] * [1, 1]
     h = np.linspace(0.05, 0.95, 10)
-    ones, zeros = np.ones(10), np.zeros(10)
-    low = np.stack([0.15 * ones, zeros, 0.25 * ones, h], -1)
-    high = np.stack([0.55 * ones, 1 - h, 0.65 * ones, ones], -1)
-    values = LATTICE.sum(1) * 20 - 60 + seed
-    return {
-        "states": LATTICE,
-        "q": values[:, None] - np.arange(4),
-        "trajectory": path,
-        "walls": np.stack([low, high], 1),
-        "goal": np.array([0.95, 0.95]),
-    }
+    walls = np.array([[(0.15, 0, 0.25, y), (0.55, 1 - y, 0.65, 1)] for y in h])
+    q = (LATTICE.sum(1) * 20 - 60 + seed)[:, None] - np.arange(4)
+    goal = np.array([0.95, 0.95])
+    arrays = {"states": LATTICE, "q": q, "trajectory": path}
+    return arrays | {"walls": walls, "goal": goal}
 
 
 def write_fqi(
-    runs_dir: Path,
-    env: str,
-    scale: str = "smoke",
-    seeds: int = 6,
-    methods: tuple[str, ...] = METHODS,
-    lengths: dict = SHORT,
-    tag: str = "",
-    curves=as_the_paper_says,
+    runs_dir, env, seeds=6, methods=METHODS, lengths=SHORT, tag="", curves=as_claimed
 ) -> None:
     """Complete runs as the runner leaves them."""
     stage = np.repeat(np.arange(1, len(lengths[env]) + 1), lengths[env])
@@ -117,11 +96,8 @@ def write_fqi(
         def table(seed: int, method=method, index=index) -> pd.DataFrame:
             return pd.DataFrame(index | curves(env, method, seed, stage))
 
-        plan = made_up_plan(runs_dir, env, method + tag, range(seeds), scale)
+        plan = made_up_plan(runs_dir, env, method + tag, range(seeds))
         write_seeds(plan, table, maze_arrays if env == "maze" else lambda s: {}, facts)
-
-
-# --- linear system
 
 
 def steps_of(method: str) -> list[tuple[int, int, list[int]]]:
@@ -159,13 +135,12 @@ def dqn_table(method: str, seed: int, scatter: float = 5.0) -> pd.DataFrame:
 
 
 def dqn_arrays(method: str) -> dict[str, np.ndarray]:
-    x, y = PLANE[:, 0], PLANE[:, 2]
-    value = -30 * (x**2 + y**2) - 100
-    pull = -np.stack([x, y], 1) @ ACTIONS.T  # towards the origin
-    stages = len(steps_of(method))
+    position = PLANE[:, ::2]
+    value = -30 * (position**2).sum(1, keepdims=True) - 100
+    q = value - position @ ACTIONS.T  # pulled towards the origin
     return {
         "states": PLANE,
-        "q_stages": np.repeat((value[:, None] + pull)[None], stages, 0),
+        "q_stages": np.stack([q] * len(steps_of(method))),
         "actions": ACTIONS,
         "pathway": np.array([-5, -0.5, 1, 0.5]),
         "goal": np.array([0, 0, 0.2]),
@@ -175,14 +150,7 @@ def dqn_arrays(method: str) -> dict[str, np.ndarray]:
 
 
 def write_dqn(
-    runs_dir: Path,
-    methods: tuple[str, ...] = SEVEN,
-    seeds: range = range(6),
-    tag: str = "",
-    env: str = "linear_system",
-    config: dict | None = None,
-    shift: float = 0.0,
-    scatter: float = 5.0,
+    runs_dir, methods=SEVEN, seeds=range(6), tag="", config=None, shift=0.0, scatter=5.0
 ) -> None:
     """Complete runs as the runner leaves them."""
     for method in methods:
@@ -195,9 +163,10 @@ def write_dqn(
             found.loc[found["task"] == 2, "return"] += shift
             return found
 
-        plan = made_up_plan(runs_dir, env, method + tag, seeds, config=config)
+        place = (runs_dir, "linear_system", method + tag, seeds)
+        plan = made_up_plan(*place, config=config)
         write_seeds(plan, table, lambda seed, m=method: dqn_arrays(m), facts)
 
 
-def csv_of(runs_dir: Path, folder: str, seed: int, env: str = "linear_system") -> Path:
-    return seed_path(runs_dir / "smoke" / env / folder, seed, "csv")
+def csv_of(runs_dir: Path, folder: str, seed: int) -> Path:
+    return seed_path(runs_dir / "smoke/linear_system" / folder, seed, "csv")

@@ -10,6 +10,7 @@ from bcrl.envs.rendering import draw
 from bcrl.report.animation import frames, typical_seed
 from bcrl.report.load import load_runs
 from bcrl.results.layout import seed_path
+from bcrl.results.read import read_arrays
 from bcrl.run import runner
 from tests.conftest import plan
 from tests.report.runs import report
@@ -17,36 +18,25 @@ from tests.results.made_up import made_up_plan, write_seeds
 
 SMALL = ("scale=smoke", "seeds.count=2", "progress=none")
 CAR = CarOnHill(mass=1.2)
-SECTION = {
-    "name": "car_on_hill",
-    "tasks": {"mass": [0.8, 1.2]},
-    "gamma": 0.95,
-    "horizon": 100,
-    "metrics": ["q_error", "return"],
-}
+SECTION = {"name": "car_on_hill", "tasks": {"mass": [0.8, 1.2]}, "gamma": 0.95}
+SECTION |= {"horizon": 100, "metrics": ["q_error", "return"]}
 
 
 def episode(length: int = 6) -> dict[str, np.ndarray]:
     """What a run of the car records, driven to the right."""
-    states = [CAR.initial(np.empty(0))]
-    for _ in range(length):
-        states.append(CAR.step(states[-1], np.int64(1))[0])
-    actions = np.ones(length, np.int64)
+    states, actions = [CAR.initial(np.empty(0))], np.ones(length, np.int64)
+    for action in actions:
+        states.append(CAR.step(states[-1], action)[0])
     return {"trajectory": np.stack(states), "trajectory_actions": actions}
 
 
-def write_cars(
-    runs_dir, name="BC-FQI", returns=(0.5,), arrays=None, section=SECTION
-) -> None:
+def write_cars(runs_dir, name="BC-FQI", returns=(0.5,), arrays=None, section=SECTION):
     """Complete runs of the car; seed i ends with `returns[i]`."""
     seeds, config = range(len(returns)), {"env": section}
     made = made_up_plan(runs_dir, "car_on_hill", name, seeds, config=config)
-    index = {"stage": [1, 2], "task": [1, 2], "iteration": [1, 2]}
-    write_seeds(
-        made,
-        lambda seed: pd.DataFrame({**index, "q_error": 1.0, "return": returns[seed]}),
-        lambda seed: episode() if arrays is None else arrays,
-    )
+    row = {"stage": 1, "task": 1, "iteration": 1, "q_error": 1.0}
+    tables = [pd.DataFrame([row | {"return": value}]) for value in returns]
+    write_seeds(made, tables.__getitem__, lambda seed: arrays or episode())
 
 
 def gifs(runs_dir, *options: str) -> list[str]:
@@ -55,13 +45,18 @@ def gifs(runs_dir, *options: str) -> list[str]:
     return [path.stem.split("_")[-2] for path in sorted(runs_dir.glob("figures/*.gif"))]
 
 
-@pytest.mark.parametrize("env", ["maze", "car_on_hill"])
-def test_a_recorded_episode_is_what_the_task_makes_of_its_actions(env, tmp_path):
-    p = plan(f"env={env}", "variant=C", *SMALL, f"runs_dir={tmp_path}")
+def recorded(runs_dir, *choice: str):
+    """Run a plan; the plan, states and actions of each seed's episode."""
+    p = plan(*choice, *SMALL, f"runs_dir={runs_dir}")
     runner.run(p)
     for seed in p.seeds:
-        with np.load(seed_path(p.directory, seed, "npz")) as stored:
-            states, actions = stored["trajectory"], stored["trajectory_actions"]
+        path = seed_path(p.directory, seed, "npz")
+        yield p, *read_arrays(path, "trajectory", "trajectory_actions")
+
+
+@pytest.mark.parametrize("env", ["maze", "car_on_hill"])
+def test_a_recorded_episode_is_what_the_task_makes_of_its_actions(env, tmp_path):
+    for p, states, actions in recorded(tmp_path, f"env={env}", "variant=C"):
         assert (states[0] == p.target.initial(np.empty(0))).all()
         after, _, absorbing = p.target.step(states[:-1], actions)
         np.testing.assert_allclose(after, states[1:], atol=1e-12)
@@ -70,14 +65,9 @@ def test_a_recorded_episode_is_what_the_task_makes_of_its_actions(env, tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", ["BC", "RPL"])
-def test_dqn_records_a_greedy_episode_of_the_target(variant, tmp_path):
-    choice = ("env=linear_system", "algorithm=dqn", f"variant={variant}")
-    p = plan(*choice, *SMALL, f"runs_dir={tmp_path}")
-    runner.run(p)
-    for seed in p.seeds:
-        with np.load(seed_path(p.directory, seed, "npz")) as stored:
-            states, actions = stored["trajectory"], stored["trajectory_actions"]
+def test_dqn_records_a_greedy_episode_of_the_target(tmp_path):
+    choice = ("env=linear_system", "algorithm=dqn", "variant=RPL")
+    for p, states, actions in recorded(tmp_path, *choice):
         assert abs(states[0] - [-4, 0, 0, 0]).max() <= 0.4
         noise = np.full((len(actions), 8), 0.5)  # no push; a fresh start in the middle
         after, _, _ = p.target.step(states[:-1], actions, noise)

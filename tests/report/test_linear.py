@@ -5,22 +5,13 @@ import pandas as pd
 import pytest
 
 from bcrl.errors import BcrlError
-from bcrl.report.claims.document import claims_report
+from bcrl.report.claims import claims_report
 from bcrl.report.figures import style
 from bcrl.report.figures.linear import figure_4a, figure_4b, pretraining, prior
 from bcrl.report.load import load_runs
-from bcrl.report.sweeps import sweep_sections, sweep_table
-from bcrl.report.tables import number
-from tests.report.runs import (
-    SEVEN,
-    csv_of,
-    report,
-    verdicts_of,
-    write_dqn,
-)
+from bcrl.report.tables import number, sweep_sections, sweep_table
+from tests.report.runs import SEVEN, csv_of, report, verdicts_of, write_dqn
 from tests.results.made_up import edit_csv, made_up_plan, reseal, write_seeds
-
-# --- reading
 
 
 def test_runs_are_read_without_a_note(tmp_path):
@@ -31,9 +22,7 @@ def test_runs_are_read_without_a_note(tmp_path):
     assert runs.notes == []
     methods = runs.methods("linear_system", None, "DQN")
     assert tuple(methods) == SEVEN
-    assert methods["C-DQN"].index[[0, -1]].tolist() == [500, 40500]
     assert methods["C-DQN"].metrics["loss"].shape == (6, 52)
-    assert runs.methods("linear_system", None) == {}
 
 
 def test_failed_seeds_are_left_out_by_name(tmp_path):
@@ -49,8 +38,7 @@ def test_failed_seeds_are_left_out_by_name(tmp_path):
     document = claims_report(runs)
     assert "| DQN | 5 (1 failed) |" in document
     assert "S-DQN 5 of 6 seeds" in document
-    with style.sheet():
-        footer = figure_4a(runs).get_supxlabel()
+    footer = figure_4a(runs).get_supxlabel()
     assert "INCOMPLETE: DQN 5 of 6 seeds (1 failed)" in footer
     assert "S-DQN 5" not in footer  # which figure 4 does not compare
 
@@ -61,10 +49,6 @@ def test_failed_seeds_are_left_out_by_name(tmp_path):
         (lambda t: t.assign(greedy_return=np.inf), "greedy_return in row"),
         (lambda t: t.assign(step=t["step"][::-1].to_numpy()), "fall"),
         (lambda t: t.assign(step=t["step"] + 0.5), "whole number"),
-        (
-            lambda t: t.assign(step=range(1, 42)).rename(columns={"step": "iteration"}),
-            "has the header stage,task,iteration",
-        ),
     ],
 )
 def test_bad_tables_are_rejected(tmp_path, edit, message):
@@ -75,19 +59,11 @@ def test_bad_tables_are_rejected(tmp_path, edit, message):
     assert message in str(rejected.value)
 
 
-# --- figure 4
-
-
 @pytest.mark.parametrize(
-    ("methods", "seeds"),
-    [
-        (("C-DQN", "S-DQN"), 1),
-        pytest.param(("RPL",), 2, marks=pytest.mark.slow),
-        pytest.param(SEVEN, 3, marks=pytest.mark.slow),
-    ],
+    "methods", [("C-DQN", "S-DQN"), pytest.param(SEVEN, marks=pytest.mark.slow)]
 )
-def test_both_figures_are_drawn(tmp_path, capsys, methods, seeds):
-    write_dqn(tmp_path, methods, range(seeds))
+def test_both_figures_are_drawn(tmp_path, capsys, methods):
+    write_dqn(tmp_path, methods, range(2))
     assert report(tmp_path, "--figures", "4a", "4b") == 0
     names = {f"figure_4{x}_smoke.{k}" for x in "ab" for k in ("png", "pdf")}
     names |= {"aggregate_dqn_smoke.csv", "claims_smoke.md", "report_smoke.html"}
@@ -99,8 +75,7 @@ def test_both_figures_are_drawn(tmp_path, capsys, methods, seeds):
 def test_curves_are_the_means_of_the_records(tmp_path):
     """Each method's line covers its target rows only, at steps of all stages."""
     write_dqn(tmp_path)
-    with style.sheet():
-        left, right = figure_4a(load_runs(tmp_path, "smoke")).axes
+    left, right = figure_4a(load_runs(tmp_path, "smoke")).axes
     lines = {x.get_color(): x for x in left.lines if x.get_linewidth() > 1.5}
     paths = csv_of(tmp_path, "C-DQN", 0).parent.glob("*.csv")
     tables = [pd.read_csv(path) for path in paths]
@@ -126,17 +101,13 @@ def test_shown_pretraining_and_priors(tmp_path):
     runs = load_runs(tmp_path, "smoke")
     found = pretraining(runs.compared("linear_system", None, "DQN"))
     assert {k: v.method for k, v in found.items()} == {"lspi": "RPL", "dqn": "C-DQN"}
-    with style.sheet():
-        titles = [axes.get_title() for axes in figure_4b(runs).axes]
+    titles = [axes.get_title() for axes in figure_4b(runs).axes]
     assert titles[0].endswith("seed 3") and titles[1].endswith("seed 10")
     *_, value, force = prior(found["lspi"], 3)
     assert value.shape == (41, 41)
     assert value[20, 20] == value.max()
     assert force[40, 20].tolist() == [-1.0, 0.0]  # x-major: far right, pulled left
     assert force[20, 0].tolist() == [0.0, 1.0]
-
-
-# --- tags, claims
 
 
 @pytest.mark.slow
@@ -148,19 +119,12 @@ def test_untagged_runs_stand_in(tmp_path, capsys):
     assert report(tmp_path, "--tag", "released", "--figures", "4a") == 0
     assert "figure_4a_smoke@released.png" in capsys.readouterr().out
     runs = load_runs(tmp_path, "smoke")
-    methods = runs.compared("linear_system", "released", "DQN")
-    assert [v.name for v in methods.values()] == [
-        name + "@released" * (name in boosted) for name in SEVEN
-    ]
-    with style.sheet():
-        footer = figure_4a(runs, "released").get_supxlabel()
+    footer = figure_4a(runs, "released").get_supxlabel()
     shown = "@released: BC-DQN, SC-DQN, SBC-DQN"
     assert shown in footer and "seeds differ" in footer
     document = (tmp_path / "figures" / "claims_smoke@released.md").read_text()
     assert f"{shown}; the others are untagged." in document
     assert "| BC-DQN@released | 3 |" in document
-    assert report(tmp_path, "--tag", "nowhere", "--figures", "4a") == 0
-    assert "linear_system/*@nowhere" in capsys.readouterr().err
 
 
 def test_claims(tmp_path):
@@ -182,13 +146,9 @@ def test_late_returns_recomputed(tmp_path):
     methods = load_runs(tmp_path, "smoke").methods("linear_system", None, "DQN")
     for name, variant in methods.items():
         table = pd.read_csv(csv_of(tmp_path, name, 4))
-        expected = table["return"][-5:].mean()
-        assert variant.late("return")[4] == pytest.approx(expected)
+        assert variant.late("return")[4] == pytest.approx(table["return"][-5:].mean())
         target = table["return"][table["task"] == 2]
         assert variant.area("return")[4] == pytest.approx(target.mean())
-
-
-# --- searches
 
 
 def test_variants_of_a_method_are_compared(tmp_path):

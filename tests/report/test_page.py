@@ -13,12 +13,7 @@ import pytest
 from PIL import Image
 
 from bcrl.report.curve_data import curve_data
-from bcrl.report.figures.curves import (
-    POINTS,
-    figure_curves,
-    shared_spans,
-    spread_rows,
-)
+from bcrl.report.figures.curves import POINTS, figure_curves, shared_spans, spread_rows
 from bcrl.report.load import load_runs
 from bcrl.results.layout import DQN_METRICS
 from tests.report.runs import report, write_fqi
@@ -28,9 +23,7 @@ OWN = "my_<i>env"  # folders can be called so
 MINE = {"env": {"name": "mine", "metrics": ["return", "height"]}}
 
 
-def write_steps(
-    root: Path, env: str, method: str, stages: list[int], tasks: list[int]
-) -> None:
+def write_steps(root: Path, env: str, method: str, stages: list, tasks: list) -> None:
     """Rows every 1000 steps; where a stage ends and the next begins, two at a step."""
     starts = np.concatenate([[0], np.cumsum(stages)])
 
@@ -115,10 +108,8 @@ def test_long_curves_keep_their_stages_ends(tmp_path):
 def test_the_pages_curves_are_the_aggregates(reported):
     text = re.search(r'"curves-data">(.*?)</script>', page_of(reported), re.S)[1]
     found = {data["id"]: data for data in json.loads(text)}
-    for family, name, count in (
-        ("FQI", "aggregate", "iteration"),
-        ("DQN", "aggregate_dqn", "step"),
-    ):
+    names = {"FQI": ("aggregate", "iteration"), "DQN": ("aggregate_dqn", "step")}
+    for family, (name, count) in names.items():
         table = pd.read_csv(reported / f"figures/{name}_smoke.csv")
         for series in found[f"{OWN}-{family}"]["series"]:
             rows = table[table["variant"] == series["name"]]

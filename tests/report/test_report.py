@@ -2,29 +2,23 @@
 
 import io
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from matplotlib.figure import Figure
 from scipy import stats
 
 from bcrl.report import statistics as st
-from bcrl.report.claims.document import claims_report
-from bcrl.report.claims.judge import verdict
+from bcrl.report.claims import claims_report, verdict
 from bcrl.report.figures import curves, style
 from bcrl.report.figures.maze import figure_3, seed_mean_value
 from bcrl.report.load import load_runs
-from bcrl.report.tables import aggregate, interquartile_mean
-from bcrl.report.variants import METHODS, Runs
+from bcrl.report.tables import aggregate
+from bcrl.report.variants import METHODS, remarks
 from bcrl.results.layout import FQI_METRICS, seed_path
 from tests.report.runs import (
-    LATTICE,
-    LENGTHS,
-    as_the_paper_says,
+    as_claimed,
     maze_arrays,
     report,
     the_opposite,
@@ -49,16 +43,12 @@ def runs_dir(written, tmp_path: Path) -> Path:
     return shutil.copytree(written, tmp_path / "runs")
 
 
-# --- statistics
-
-
-def test_standard_error_and_interquartile_mean():
+def test_standard_error():
     values = np.array([[1.0, 4.0], [3.0, 4.0]])
     # The paper's: the deviation of 1, 3 with ddof = 0 is 1, over √2.
     assert st.standard_error(values) == pytest.approx([1 / np.sqrt(2), 0.0])
     assert st.standard_error(values, ddof=1) == pytest.approx([1.0, 0.0])
     assert np.isnan(st.standard_error(values[:1], ddof=1)).all()
-    assert interquartile_mean([100.0, 1.0, 2.0, 3.0, -50.0]) == "2.000"
 
 
 def test_bootstrap_of_two_values_is_the_binomial():
@@ -73,12 +63,10 @@ def test_bootstrap_of_two_values_is_the_binomial():
 
 
 def test_bootstrap_of_a_difference():
-    same = np.full(5, 3.0)
-    assert st.bootstrap(same + 2, same) == (2.0, 2.0)
-    # independent resampling: variances add, so the interval is √2 times as wide
+    """Resampling is independent: variances add, the interval is √2 times as wide."""
     values = np.random.default_rng(2).normal(size=50)
-    low, high = st.bootstrap(values, values)
-    assert low < 0 < high
+    low, high = st.bootstrap(values + 2, values)
+    assert low < 2 < high
     ratio = (high - low) / np.ptp(st.bootstrap(values))
     assert ratio == pytest.approx(np.sqrt(2), rel=0.05)
 
@@ -102,10 +90,6 @@ def test_intervals_of_curves_are_those_of_means(monkeypatch):
     values[3, 1] = np.nan
     gaps = np.isnan(st.bootstrap_curves(values))
     assert gaps.tolist() == [[False, True, False, False, False]] * 2
-    assert np.isnan(st.bootstrap_curves(values[:1])).all()
-
-
-# --- figures
 
 
 @pytest.mark.slow
@@ -124,25 +108,23 @@ def test_everything_is_written_listed_and_byte_identical(runs_dir, tmp_path, cap
         assert first == second
 
 
-@pytest.mark.parametrize("draw", [curves.figure_2, curves.figure_5])
-def test_task_labels_do_not_overlap(tmp_path, draw):
+def test_task_labels_do_not_overlap(tmp_path):
     """At the paper's stage lengths, where the first four bands are very narrow."""
-    write_fqi(tmp_path, "maze", seeds=2, lengths=LENGTHS)
-    with style.sheet():
-        figure: Figure = draw(load_runs(tmp_path, "smoke"))
-        figure.draw_without_rendering()
-        for axes in figure.axes:
-            boxes = [text.get_window_extent() for text in axes.texts]
-            assert [t.get_text() for t in axes.texts] == [f"T{i}" for i in range(1, 11)]
-            for i, box in enumerate(boxes):
-                assert not any(box.overlaps(other) for other in boxes[:i])
+    lengths = {"maze": (10, 10, 10, 10, 20, 20, 50, 50, 50, 50)}
+    write_fqi(tmp_path, "maze", seeds=2, lengths=lengths)
+    figure = curves.figure_2(load_runs(tmp_path, "smoke"))
+    figure.draw_without_rendering()
+    for axes in figure.axes:
+        boxes = [text.get_window_extent() for text in axes.texts]
+        assert [t.get_text() for t in axes.texts] == [f"T{i}" for i in range(1, 11)]
+        for i, box in enumerate(boxes):
+            assert not any(box.overlaps(other) for other in boxes[:i])
 
 
 def test_curves_and_aggregates_are_recomputed(written):
     """Figure 1's bold lines and a row of the table, from the CSVs."""
     runs = load_runs(written, "smoke")
-    with style.sheet():
-        axes = curves.figure_1(runs).axes[0]
+    axes = curves.figure_1(runs).axes[0]
     bold = {line.get_color(): line for line in axes.lines if line.get_linewidth() > 1}
     paths = sorted((written / "smoke/car_on_hill/BC-FQI").glob("*.csv"))
     tables = np.stack([pd.read_csv(path)[["q_error", "return"]] for path in paths])
@@ -167,8 +149,7 @@ def test_values_are_of_the_seed_mean(runs_dir):
     assert value.shape == (21, 21)
     assert value[3, 20] == pytest.approx((x[3] + y[20]) * 20 - 60 + np.mean(range(6)))
     for seed in range(6):  # every seed prefers another action, by as much
-        q = np.zeros((441, 4))
-        q[:, seed % 2] = 1.0
+        q = np.tile([1 - seed % 2, seed % 2, 0, 0], (441, 1))
         path = seed_path(variant.folder, seed, "npz")
         np.savez(path, **(maze_arrays(seed) | {"q": q}))
     assert seed_mean_value(variant)[2] == pytest.approx(0.5)
@@ -176,8 +157,7 @@ def test_values_are_of_the_seed_mean(runs_dir):
 
 def test_figure_3_with_fewer_methods(tmp_path):
     write_fqi(tmp_path, "maze", methods=("FQI", "BC-FQI"), seeds=2)
-    with style.sheet():
-        figure = figure_3(load_runs(tmp_path, "smoke"))
+    figure = figure_3(load_runs(tmp_path, "smoke"))
     titles = [a.get_title() for a in figure.axes if a.get_title()]
     assert titles[:4] == ["T1", "T4", "T7", "T10"]
     assert titles[-4:] == ["FQI: 0 of 2 arrive", *METHODS[1:3], "BC-FQI: 2 of 2 arrive"]
@@ -194,62 +174,44 @@ def test_tagged_variants_are_drawn_on_request(tmp_path, capsys):
     assert set(table["variant"]) == {"FQI", "BC-FQI", "BC-FQI@released"}
 
 
-# --- claims
-
-
-@pytest.mark.parametrize("curves", [as_the_paper_says, the_opposite])
+@pytest.mark.parametrize("curves", [as_claimed, the_opposite])
 def test_true_claims_hold_and_false_ones_do_not(tmp_path, curves):
     for env in FQI_METRICS:
         write_fqi(tmp_path, env, curves=curves)
     document = claims_report(load_runs(tmp_path, "smoke"))
     car, maze = (verdicts_of(document, section) for section in ("Car", "Maze"))
     assert (len(car), len(maze)) == (12, 17)
-    if curves is as_the_paper_says:
+    if curves is as_claimed:
         assert {*car.values(), *maze.values()} == {"holds"}
         return
-    for found, claim in (
-        (car, "BC-FQI ends with a smaller error than FQI"),
-        (maze, "BC-FQI ends with a larger return than FQI"),
-        (car, "C-FQI's error rises on the target task"),
-        (maze, "FQI never solves the target"),
-        (maze, "BC-FQI's residual at s0 shrinks from T1 to T6"),
-        (maze, "most seeds of BC-FQI end at the optimum"),
+    for claim in (
+        "BC-FQI ends with a larger return than FQI",
+        "FQI never solves the target",
+        "BC-FQI's residual at s0 shrinks from T1 to T6",
+        "most seeds of BC-FQI end at the optimum",
     ):
-        assert found[claim] == "does not hold"
-
-
-def test_few_seeds_and_absent_methods_decide_nothing(tmp_path):
-    write_fqi(tmp_path, "car_on_hill", seeds=2, methods=("FQI", "BC-FQI"))
-    found = verdicts_of(claims_report(load_runs(tmp_path, "smoke")), "Car")
-    few = "undecided (fewer than 5 seeds)"
-    assert found["BC-FQI ends with a smaller error than FQI"] == few
-    assert found["C-FQI's error jumps from T1 to T2"] == "no runs of C-FQI"
+        assert maze[claim] == "does not hold"
+    assert car["C-FQI's error rises on the target task"] == "does not hold"
 
 
 @pytest.mark.parametrize(
     ("low", "high", "expect", "expected"),
     [
-        (-2.0, -1.0, "< 0", "holds"),
-        (-2.0, -1.0, "> 0", "does not hold"),
         (-1.0, 1.0, "< 0", "undecided"),
         (-1.0, 0.0, "≤ 0", "holds"),
         (0.0, 1.0, "< 0", "does not hold"),
-        (0.6, 0.9, "> ½", "holds"),
         (0.4, 0.9, "> ½", "undecided"),
-        (0.0, 0.0, "= 0", "holds"),
     ],
 )
 def test_verdicts(low, high, expect, expected):
     value = (low + high) / 2
-    assert verdict(value, (low, high), expect, seeds=9) == expected
-
-
-# --- what is incomplete, odd or broken
+    assert verdict(value, (low, high), expect, seeds=5) == expected
+    assert verdict(value, (low, high), expect, seeds=4).startswith("undecided (fewer")
 
 
 def test_a_diverging_method_is_named_and_cut_off(tmp_path):
     def far(env, method, seed, stage):
-        curves = as_the_paper_says(env, method, seed, stage)
+        curves = as_claimed(env, method, seed, stage)
         if method == "B-FQI":
             curves["q_error"] *= 1000.0 ** (stage - 1)
         return curves
@@ -258,32 +220,19 @@ def test_a_diverging_method_is_named_and_cut_off(tmp_path):
     runs = load_runs(tmp_path, "smoke")
     (note,) = runs.notes
     assert "B-FQI: diverges, q_error up to 4.5" in note.text
-    with style.sheet():
-        axes = curves.figure_1(runs).axes[0]
+    axes = curves.figure_1(runs).axes[0]
     assert axes.get_ylim()[1] < 1.0
     assert "cut: B-FQI diverges" in {text.get_text() for text in axes.texts}
 
 
-def folder_of(runs_dir: Path, method: str) -> Path:
-    return runs_dir / "smoke" / "car_on_hill" / method
-
-
-def footer_of(runs: Runs, *methods: str, compares: bool = True) -> str:
-    found = runs.methods("car_on_hill", None)
-    shown = {name: found[name] for name in methods or found}
-    figure = Figure(figsize=(7.0, 3.0))
-    style.footer(figure, runs, shown, "", compares)
-    return figure.get_supxlabel()
-
-
 def test_incomplete_seeds_are_named_and_left_out_on_request_only(runs_dir, capsys):
     """B-FQI's seeds 2 (never begun), 4 (not ended) and 5 (diverged)."""
-    folder = folder_of(runs_dir, "B-FQI")
+    folder = runs_dir / "smoke/car_on_hill/B-FQI"
     for path in folder.glob("seed_0002.*"):
         path.unlink()
     reseal(folder / "seed_0004.json", status="running")
     reseal(folder / "seed_0005.json", status="failed: non-finite weights")
-    names = ("seed 2", '"running"', '"failed: non-finite weights"')
+    names = ("seeds 2", '"running"', '"failed: non-finite weights"')
     assert report(runs_dir, "--figures", "2") == 2  # the aggregate has both
     err = capsys.readouterr().err
     assert all(name in err for name in (*names, "--allow-incomplete"))
@@ -294,38 +243,32 @@ def test_incomplete_seeds_are_named_and_left_out_on_request_only(runs_dir, capsy
     assert "0–5: FQI, C-FQI and BC-FQI; 0–1, 3: B-FQI" in err
     runs = load_runs(runs_dir, "smoke", allow_incomplete=True)
     shown = "INCOMPLETE: B-FQI 3 of 6 seeds (1 failed)"
-    with style.sheet():
-        assert shown in curves.figure_1(runs).get_supxlabel().splitlines()
+    assert shown in curves.figure_1(runs).get_supxlabel().splitlines()
     document = (runs_dir / "figures" / "claims_smoke.md").read_text()
     assert f"**{shown}**" in document.splitlines()[:4]
-    assert "seed 2" in document.split("## Notes")[1]
-    alone = footer_of(runs, "FQI", compares=False)
-    assert "INCOMPLETE" not in alone and "Note" not in alone
+    assert "seeds 2" in document.split("## Notes")[1]
+    fqi = {"FQI": runs.methods("car_on_hill", None)["FQI"]}
+    assert remarks(runs, fqi, compares=False) == []
 
 
 def test_a_method_without_a_complete_seed_is_named(runs_dir):
-    for path in folder_of(runs_dir, "C-FQI").glob("seed_*.json"):
+    for path in runs_dir.glob("smoke/car_on_hill/C-FQI/seed_*.json"):
         reseal(path, status="running")
     runs = load_runs(runs_dir, "smoke", allow_incomplete=True)
-    assert "C-FQI" not in runs.methods("car_on_hill", None)
-    for text in (footer_of(runs), claims_report(runs)):
+    for text in (curves.figure_1(runs).get_supxlabel(), claims_report(runs)):
         assert "INCOMPLETE: C-FQI 0 of 6 seeds" in text and "no runs of C-FQI" in text
-    assert "INCOMPLETE" not in footer_of(runs, "BC-FQI", compares=False)
 
 
 def test_broken_files_are_rejected_even_so(runs_dir, capsys):
-    folder = folder_of(runs_dir, "FQI")
+    folder = runs_dir / "smoke/car_on_hill/FQI"
     for seed in range(6):
         (folder / f"seed_{seed:04d}.csv").write_text("")
         (folder / f"seed_{seed:04d} (copy).npz").write_text("")
-    for more in ([], ["--allow-incomplete"]):
-        assert report(runs_dir, "--figures", "1", *more) == 2
-        err = capsys.readouterr().err
-        assert f"{folder}/seed_0003.csv " in err
-        assert f"delete {folder}/seed_0003.*" in err
-        assert f"and 2 more; `bcrl-verify {runs_dir}`" in err
-        assert "Traceback" not in err
-    assert not (runs_dir / "figures").exists()
+    assert report(runs_dir, "--figures", "1", "--allow-incomplete") == 2
+    err = capsys.readouterr().err
+    assert f"{folder}/seed_0003.csv " in err
+    assert f"delete {folder}/seed_0003.*" in err
+    assert f"and 2 more; `bcrl-verify {runs_dir}`" in err
 
 
 def test_unequal_methods_and_absent_ones_are_named(tmp_path):
@@ -351,7 +294,7 @@ def test_variants_that_record_too_little_are_left_out_by_name(tmp_path):
 def test_pickled_arrays_are_rejected(runs_dir, capsys):
     path = seed_path(runs_dir / "smoke" / "maze" / "FQI", 2, "npz")
     stored = io.BytesIO()
-    np.savez(stored, q=np.array([{}], dtype=object), states=LATTICE)
+    np.savez(stored, states=0, q=np.array([{}], dtype=object))
     rerecord(path, stored.getvalue())
     assert report(runs_dir, "--figures", "3") == 2
     assert f"{path} is not a readable NPZ: delete" in capsys.readouterr().err
@@ -360,21 +303,13 @@ def test_pickled_arrays_are_rejected(runs_dir, capsys):
 def test_without_runs_or_a_place_to_write_the_remedy_is_named(tmp_path, capsys):
     assert report(tmp_path) == 2
     assert "`bcrl experiment=fig1 scale=smoke`" in capsys.readouterr().err
-    write_fqi(tmp_path, "car_on_hill", scale="quick", seeds=1)
+    write_fqi(tmp_path, "car_on_hill", seeds=1)
+    (tmp_path / "smoke").rename(tmp_path / "quick")
     assert report(tmp_path) == 2
     assert "there are runs at scale quick" in capsys.readouterr().err
     # Runs of another scale do not matter, even broken ones.
-    (tmp_path / "quick/car_on_hill/FQI/config.yaml").unlink()
     write_fqi(tmp_path, "car_on_hill", seeds=1)
     assert report(tmp_path, "--figures", "2") == 0
     (tmp_path / "out").write_text("")
     assert report(tmp_path, "--out", str(tmp_path / "out"), "--figures", "2") == 2
     assert f"--out: can't make {tmp_path}/out" in capsys.readouterr().err
-
-
-def test_reading_and_drawing_load_neither_hydra_nor_torch_nor_numba():
-    program = "import sys, bcrl.report.cli, bcrl.results.verify, bcrl.results.loggers; "
-    program += "print({'hydra', 'torch', 'numba'} & {*sys.modules})"
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.stdout == "set()\n", done.stderr

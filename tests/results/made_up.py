@@ -28,20 +28,10 @@ def made_up_plan(
         "workers": 1,
         "tag": tag or None,
     }
-    return Plan(
-        env=env,
-        variant=variant,
-        tag=tag or None,
-        family="",
-        stages=(),
-        tasks=(),
-        metrics=(),
-        asked=tuple(seeds),
-        seeds=tuple(seeds),
-        lockstep=1,
-        device="cpu",
-        config=whole | dict(config or {}),
-    )
+    about = {"env": env, "variant": variant, "tag": tag or None, "family": ""}
+    about |= dict.fromkeys(("asked", "seeds"), tuple(seeds))
+    about |= dict.fromkeys(("stages", "tasks", "metrics"), ())
+    return Plan(**about, lockstep=1, device="cpu", config=whole | (config or {}))
 
 
 def write_seeds(

@@ -77,7 +77,6 @@ def test_an_interrupted_run_logs_nothing_twice(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("section", "key", "value"),
     [
-        ({"name": None}, "logger", {"name": None}),
         ({"name": "tensorbord"}, "logger.name", "tensorbord"),
         ({"name": "none", "folder": "x"}, "logger.folder", "x"),
         ({"name": "os.System"}, "logger.name", "os.System"),

@@ -13,7 +13,7 @@ import yaml
 
 from bcrl.common.identity import identity
 from bcrl.results import verify
-from bcrl.results.layout import DQN_METRICS, FQI_METRICS, seed_path
+from bcrl.results.layout import DQN_METRICS, FQI_METRICS, SUFFIXES, seed_path
 from tests.results.made_up import made_up_plan, write_seeds
 
 VARIANTS = {
@@ -23,7 +23,6 @@ VARIANTS = {
 }
 SEEDS = 2
 TRIES = 48  # of each kind
-SUFFIXES = ("csv", "npz", "json")
 Rng = np.random.Generator
 
 
@@ -41,9 +40,6 @@ def grow(root: Path) -> None:
         plan = made_up_plan(root, env, variant, range(SEEDS))
         facts = {"optimum": -47.5, "cpu_seconds": 1.25}
         write_seeds(plan, table, lambda _: {"q": rng.normal(size=6)}, facts)
-
-
-# --- what can happen: to the bytes of a file, to one or two files, to more
 
 
 def other_number(data: bytes, at: int, rng: Rng) -> bytes:
@@ -96,7 +92,6 @@ FILES: dict[str, Callable[[Path, Path], object]] = {
     "copy a seed": copy_seed,
     "copy a folder": copy_folder,
 }
-#: Names such as people, programs and other commands give.
 NEW = ("seed_0000 (copy).csv", "seed_0001.csv.bak", "seed_0001.json~")
 NEW += ("seed_0002.csv", "seed_0002.json", "seed_0002.npz")
 
@@ -111,9 +106,6 @@ def mutate(kind: str, root: Path, rng: Rng) -> None:
     else:
         new = [root / "smoke" / variant / name for variant in VARIANTS for name in NEW]
         FILES[kind](one, rng.choice([path for path in files + new if path != one]))
-
-
-# --- what has changed, and what is named
 
 
 def value(name: str, data: bytes) -> object:

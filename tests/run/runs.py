@@ -64,7 +64,7 @@ def at_row(patch: pytest.MonkeyPatch, number: int, act: Callable[[], object]) ->
         if len(rows) == number:
             act()
 
-    patch.setattr(loggers.Nothing, "write", write)
+    patch.setattr(loggers.Writer, "write", write)
 
 
 def results(made: Plan, seed: int) -> tuple[bytes, bytes]:

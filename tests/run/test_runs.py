@@ -164,7 +164,7 @@ def test_a_failing_job_leaves_the_others_alone_and_is_reported(tmp_path, workers
 
 
 def test_an_unforeseen_error_shows_where_it_came_from(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(loggers.Nothing, "write", lambda *_: 1 / 0)
+    monkeypatch.setattr(loggers.Writer, "write", lambda *_: 1 / 0)
     with pytest.raises(runner.SeedsFailed, match="ZeroDivisionError: division by zero"):
         run(tmp_path, *TABULAR)
     assert "Traceback" in capsys.readouterr().err

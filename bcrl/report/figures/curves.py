@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -16,14 +17,11 @@ from bcrl.report.variants import Methods, Runs, Variant
 
 POINTS = 300  # of a curve that are drawn, about
 _COLUMNS = 3  # panels beside each other
-#: What counts a family's rows, as an axis says it.
-COUNTED = {"FQI": "iteration", "DQN": "environment steps of all stages"}
+COUNTED = {"FQI": "iteration", "DQN": "environment steps of all stages"}  # on axes
 _LABELS = yaml.safe_load(Path(__file__).with_name("labels.yaml").read_text("utf-8"))
 _SEEDS = {"linewidth": 0.5, "linestyle": (0, (3, 2)), "alpha": 0.45, "zorder": 1.9}
 _TWO_ERRORS = "mean ± 2 standard errors over seeds"
 Band = tuple[np.ndarray, np.ndarray]
-_Interval = Callable[[np.ndarray], Band]
-_Rows = Callable[[Variant], np.ndarray]
 
 
 def label(family: str, metric: str) -> str:
@@ -55,8 +53,8 @@ def draw_metric(
     axes: Axes,
     methods: Methods,
     metric: str,
-    rows: _Rows | None = None,
-    interval: _Interval | None = two_errors,
+    rows: Callable[[Variant], np.ndarray] | None = None,
+    interval: Callable[[np.ndarray], Band] | None = two_errors,
 ) -> None:
     """Every method's mean over seeds with a band, or with all seeds if no `interval`.
     All rows are drawn unless `rows` chooses some. Diverging curves are cut off."""
@@ -79,7 +77,8 @@ def draw_metric(
             far.append(name)
         else:
             within += drawn
-    style.cut(axes, far, within)
+    if far and within:
+        style.cut(axes, far, within)
 
 
 def metrics_of(methods: Methods) -> list[str]:
@@ -89,21 +88,16 @@ def metrics_of(methods: Methods) -> list[str]:
 
 
 def shared_spans(methods: Methods) -> list[style.Span]:
-    """The tasks' extents, if the variants with several tasks agree on them. Others are
-    in the last task throughout."""
+    """The tasks' extents, if the variants with several tasks agree on them."""
     several = [v for v in methods.values() if len(np.unique(v.task)) > 1]
     spans = [style.task_spans(v) for v in several or methods.values()]
     return spans[0] if all(each == spans[0] for each in spans) else []
 
 
 def _panels(
-    methods: Methods,
-    labels: Mapping[str, str],
-    size: tuple[float, float],
-    rows: _Rows | None = None,
-    interval: _Interval | None = two_errors,
+    methods: Methods, labels: Mapping[str, str], size: tuple[float, float], **how: Any
 ) -> tuple[Figure, list[Axes]]:
-    """Panels of `labels`' metrics, _COLUMNS beside each other, tasks shaded."""
+    """Panels of `labels`' metrics, tasks shaded; `how` is for `draw_metric`."""
     figure, n = Figure(figsize=size), len(labels)
     columns, spans = min(_COLUMNS, n), shared_spans(methods)
     grid = figure.subplots(math.ceil(n / columns), columns, squeeze=False)
@@ -113,7 +107,7 @@ def _panels(
     for axes, (metric, ylabel) in zip(grid.flat, labels.items(), strict=False):
         if spans:
             style.shade_tasks(axes, spans)
-        draw_metric(axes, methods, metric, rows, interval)
+        draw_metric(axes, methods, metric, **how)
         axes.set(xlabel=COUNTED[family], ylabel=ylabel)
         axes.margins(x=0.0)
     return figure, list(grid.flat)
@@ -125,10 +119,10 @@ def figure_curves(runs: Runs, env: str, family: str, tag: str | None = None) -> 
     labels = {metric: label(family, metric) for metric in metrics_of(methods)}
     width = max(0.6, min(_COLUMNS, len(labels)) / 2) * style.TEXT_WIDTH
     size = width, 2.5 * math.ceil(len(labels) / _COLUMNS) + 0.7
-    figure, _ = _panels(methods, labels, size, spread_rows, bootstrap_curves)
+    how = {"rows": spread_rows, "interval": bootstrap_curves}
+    figure, _ = _panels(methods, labels, size, **how)
     style.legend(figure, methods)
-    what = "mean over seeds, bootstrapped 95 % interval"
-    style.footer(figure, runs, methods, what)
+    style.footer(figure, runs, methods, "mean over seeds, bootstrapped 95 % interval")
     return figure
 
 
@@ -144,10 +138,8 @@ def figure_1(runs: Runs, tag: str | None = None) -> Figure:
 
 def figure_2(runs: Runs, tag: str | None = None) -> Figure:
     """Maze: the paper's error at s0, the return (paper, Fig. 2) and the exact error.
-
-    The paper's error compares Q(s0, ·) with the *target's* V*(s0) in every stage;
-    the exact one averages |Q − Q*| over the states and actions of the current task.
-    """
+    The paper's error compares Q(s0, ·) with the *target's* V*(s0) in every stage; the
+    exact one averages |Q − Q*| over the states and actions of the current task."""
     methods = runs.methods("maze", tag)
     target = max(int(variant.task.max()) for variant in methods.values())
     labels = {
@@ -157,10 +149,9 @@ def figure_2(runs: Runs, tag: str | None = None) -> Figure:
         "q_error": "error in the trained task\nmean |Q − Q*|",
     }
     figure, panels = _panels(methods, labels, (1.4 * style.TEXT_WIDTH, 3.2))
-    for axes in (panels[0], panels[2]):
+    for axes in panels[::2]:
         axes.set_ylim(bottom=0)
-    optimum = optimum_of(methods)
-    if optimum is not None:
+    if (optimum := optimum_of(methods)) is not None:
         panels[1].axhline(optimum, **style.OPTIMUM)
     style.legend(figure, methods, optimum=optimum is not None)
     style.footer(figure, runs, methods, _TWO_ERRORS)

@@ -42,7 +42,7 @@ def _draw_target(axes: Axes, methods: Methods) -> None:
     axes.annotate("never succeeding", (1.0, _WORST), (0, -2), **place, **_SMALL)
     draw_metric(axes, methods, "return", lambda variant: variant.target_rows)
     end = max(int(variant.index[-1]) for variant in methods.values())
-    axes.set_xlim(0, 1.03 * end)
+    axes.set(xlim=(0, 1.03 * end), ylabel="return in the target task (undiscounted)")
     bottom, top = axes.get_ylim()
     axes.set_ylim(bottom=min(bottom, _WORST - 0.07 * (top - _WORST)))  # room for a word
     switches = {
@@ -59,7 +59,6 @@ def _draw_target(axes: Axes, methods: Methods) -> None:
         text = f"{_LEARNERS.get(learner, learner)} → target"
         axes.annotate(text, (step, 1.0), (0, raised), **place, **_SMALL)
         previous = step
-    axes.set_ylabel("return in the target task (undiscounted)")
 
 
 def _draw_pretraining(axes: Axes, methods: Methods) -> None:
@@ -80,9 +79,7 @@ def _draw_pretraining(axes: Axes, methods: Methods) -> None:
 
 def figure_4a(runs: Runs, tag: str | None = None) -> Figure:
     """Linear system: return against environment steps, and the pretraining's own.
-
-    Mean ± 2 standard errors over seeds, under the exploring policy (paper, Fig. 4a).
-    """
+    Mean ± 2 standard errors over seeds, under the exploring policy (paper, Fig. 4a)."""
     methods = runs.compared(LINEAR, tag, "DQN")
     figure = Figure(figsize=(1.3 * style.TEXT_WIDTH, 3.5))
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
@@ -161,16 +158,12 @@ def _draw_environment(axes: Axes, variant: Variant) -> None:
 
 def figure_4b(runs: Runs, tag: str | None = None) -> Figure:
     """Linear system: both priors' values and greedy actions, and the target task.
-
-    LSPI's and DQN's LQ Q-functions on the plane of positions at zero velocity, each
-    with its own colour scale (paper, Fig. 4b).
-    """
+    Q in the LQ task on the plane of positions at zero velocity (paper, Fig. 4b)."""
     methods = runs.compared(LINEAR, tag, "DQN")
     found = pretraining(methods)
     figure = Figure(figsize=(1.45 * style.TEXT_WIDTH, 3.8))  # widths decide
-    panels = figure.subplots(1, 3, width_ratios=(1.15, 1.15, 1))
-    for axes in panels:
-        axes.set(xlabel="position x", ylabel="position y", aspect="equal")
+    names = {"xlabel": "position x", "ylabel": "position y", "aspect": "equal"}
+    panels = figure.subplots(1, 3, width_ratios=(1.15, 1.15, 1), subplot_kw=names)
     for axes, learner in zip(panels, _LEARNERS, strict=False):
         _draw_prior(axes, learner, found.get(learner))
     variant = next(iter(methods.values()))

@@ -13,7 +13,6 @@ from bcrl.report.variants import METHODS, Methods, Runs, Variant
 
 _MARGIN = 0.025  # half a lattice cell
 _SPREAD = 0.012  # how far apart the seeds' trajectories are drawn, in maze lengths
-_SHOWN_MAZES = 4
 
 
 def _draw_walls(axes: Axes, walls: np.ndarray, filled: bool = True) -> None:
@@ -35,8 +34,8 @@ def _draw_ends(axes: Axes, goal: np.ndarray, start: np.ndarray) -> None:
 
 def _frame(axes: Axes, title: str) -> None:
     """The unit square, without ticks."""
-    axes.set(xlim=(-_MARGIN, 1 + _MARGIN), ylim=(-_MARGIN, 1 + _MARGIN), aspect="equal")
-    axes.set(xticks=[], yticks=[])
+    limits = -_MARGIN, 1 + _MARGIN
+    axes.set(xlim=limits, ylim=limits, xticks=[], yticks=[], aspect="equal")
     axes.set_title(title, pad=3, fontsize=8)
     axes.spines[:].set_visible(True)
 
@@ -50,8 +49,7 @@ def seed_mean_value(variant: Variant) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def _draw_paths(axes: Axes, name: str, variant: Variant, goal: np.ndarray) -> None:
-    """Every seed's greedy episode; their lengths differ."""
-    # Lattice paths coincide: drawn side by side, one can see how many there are.
+    """Every seed's greedy episode, side by side: lattice paths coincide."""
     n = len(variant.seeds)
     shifts = np.linspace(-_SPREAD, _SPREAD, n) if n > 1 else [0.0]
     look = {"color": style.colour(name), "linewidth": 0.7, "alpha": 0.6, "zorder": 3}
@@ -74,17 +72,13 @@ def _grid(panel: SubFigure, methods: Methods) -> Iterator[tuple[Axes, str, Varia
 
 def figure_3(runs: Runs, tag: str | None = None) -> Figure:
     """Mazes, max_a of the seed-mean Q on the target, greedy episodes (paper, Fig. 3).
-
-    The values are drawn for all lattice points, those inside walls too, where no data
-    ever lay; every panel has its own colour scale.
-    """
+    Values are drawn inside walls too, where no data lay; colour scales differ."""
     methods = runs.methods("maze", tag)
     reference = max(methods.values(), key=lambda v: len(np.unique(v.task)))
     names = ("walls", "goal", "trajectory")
     walls, goal, path = reference.arrays(reference.seeds[0], *names)
-    figure = Figure(figsize=(11.4, 4.2))
+    figure, target = Figure(figsize=(11.4, 4.2)), f"T{len(walls)}"
     figure.get_layout_engine().set(w_pad=0.07)
-    target = f"T{len(walls)}"
     titles = (
         "(a) tasks of the curriculum",
         rf"(b) max$_a$ of the seed-mean Q(s, a) on {target}",
@@ -93,7 +87,7 @@ def figure_3(runs: Runs, tag: str | None = None) -> Figure:
     panels = figure.subfigures(1, 3, width_ratios=(1.0, 1.28, 1.0), wspace=0.03)
     for panel, title in zip(panels, titles, strict=True):
         panel.suptitle(title, fontsize=9)
-    shown = np.linspace(0, len(walls) - 1, _SHOWN_MAZES).round().astype(int)
+    shown = np.linspace(0, len(walls) - 1, 4).round().astype(int)
     for axes, task in zip(panels[0].subplots(2, 2).flat, shown, strict=True):
         _draw_walls(axes, walls[task])
         _draw_ends(axes, goal, path[0])

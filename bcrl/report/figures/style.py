@@ -17,11 +17,9 @@ from matplotlib.ticker import MaxNLocator
 
 from bcrl import __version__
 from bcrl.common.files import write_atomically
-from bcrl.report.notes import remarks, tags_shown
-from bcrl.report.variants import Methods, Runs, Variant, env_title
+from bcrl.report.variants import Methods, Runs, Variant, env_title, remarks, tags_shown
 
-#: One colour per way of transfer, in every figure and for FQI and DQN alike: Okabe and
-#: Ito's palette and a grey. Yellow is left out, it vanishes on white.
+#: One colour per way of transfer, for FQI and DQN alike: Okabe and Ito's but yellow.
 COLOURS = {
     "": "#0072B2",  # plain
     "C": "#E69F00",
@@ -73,12 +71,11 @@ def task_spans(variant: Variant) -> list[Span]:
     """Name and extent, on the axis of iterations or steps, of every task of a variant.
     An iteration reaches half a one to either side; steps continue across tasks."""
     task, steps = variant.task, variant.index
-    ends = np.flatnonzero(np.diff(task)) + 1
-    starts = itertools.pairwise([0, *ends, len(task)])
     edges = np.arange(len(task) + 1) + 0.5
     if variant.family == "DQN":
         edges = np.append(steps, steps[-1]).astype(float)
-    return [(f"T{task[a]}", edges[a].item(), edges[b].item()) for a, b in starts]
+    spans = itertools.pairwise([0, *np.flatnonzero(np.diff(task)) + 1, len(task)])
+    return [(f"T{task[a]}", edges[a].item(), edges[b].item()) for a, b in spans]
 
 
 def shade_tasks(axes: Axes, spans: Sequence[Span]) -> None:
@@ -98,11 +95,10 @@ def shade_tasks(axes: Axes, spans: Sequence[Span]) -> None:
 
 
 def cut(axes: Axes, names: Sequence[str], within: Sequence[np.ndarray]) -> None:
-    """Let the y-axis show what is `within`, and name the curves that leave it. For
-    curves `names` that diverge: they would flatten all others."""
-    shown = np.concatenate([np.ravel(values) for values in within] or [[]])
+    """Let the y-axis show what is `within`, and name the diverging curves."""
+    shown = np.concatenate([np.ravel(values) for values in within])
     shown = shown[np.isfinite(shown)]
-    if not names or not len(shown):
+    if not len(shown):
         return
     low, high = float(shown.min()), float(shown.max())
     room = 0.05 * (high - low) or 0.05 * abs(high) or 0.5
@@ -117,9 +113,8 @@ def legend(figure: Figure, methods: Iterable[str], optimum: bool = False) -> Non
     lines = [{"label": name, "linewidth": 2, **line_of(name)} for name in methods]
     if optimum:
         lines.append({"label": "optimum of the target", **OPTIMUM})
-    handles = [Line2D([], [], **line) for line in lines]
-    place = {"loc": "outside upper center", "ncols": len(lines)}
-    figure.legend(handles=handles, handlelength=1.8, **place)
+    look = {"loc": "outside upper center", "ncols": len(lines), "handlelength": 1.8}
+    figure.legend(handles=[Line2D([], [], **line) for line in lines], **look)
 
 
 def footer(
@@ -127,13 +122,12 @@ def footer(
 ) -> None:
     """Small print: environment, scale, number of seeds, `what` is drawn, what is odd.
     `compares`: differences between methods belong to it."""
-    env = next(v.env for v in methods.values())
+    env, *_ = (v.env for v in methods.values())
     counts = [len(v.seeds) for v in methods.values()]
     n = "–".join(map(str, sorted({min(counts), max(counts)})))
     seeds = f"{n} seed{'s' * (n != '1')}{' per method' * (len(counts) > 1)}"
     parts = [env_title(env), f"scale {runs.scale}", seeds, tags_shown(methods), what]
-    lines = [" · ".join(filter(None, parts))]
-    lines += remarks(runs, methods, compares)
+    lines = [" · ".join(filter(None, parts)), *remarks(runs, methods, compares)]
     limit = int(figure.get_figwidth() * _FOOTER_WIDTH)
     text = "\n".join(part for line in lines for part in textwrap.wrap(line, limit))
     figure.supxlabel(text, x=0.01, ha="left", fontsize=6.5, color="0.35")

@@ -1,0 +1,228 @@
+"""The paper's claims (claims.yaml): what decides them, verdicts, and a document."""
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import yaml
+from scipy import stats
+
+from bcrl.report import statistics, tables
+from bcrl.report.statistics import FEWEST_SEEDS, Interval
+from bcrl.report.tables import ABSENT, TEXTS, Section, TextTable, number
+from bcrl.report.variants import Methods, Runs, Variant, incomplete, listed, tags_shown
+
+_OPTIMAL = 1e-3  # a return this near V*(s0) is optimal: a detour costs 100 times more
+_NEAR = 0.01  # a mean return within this share of |V*(s0)| is nearly optimal
+#: Metrics that are shown at every stage's end, in words.
+_AT_ENDS = {
+    "q_error": "Mean error |Q − Q*| in the trained task",
+    "solved": "Share of seeds solving the trained task",
+    "residual_start": "Mean residual at s0, averaged over actions,",
+}
+
+
+class NotMeasurable(Exception):
+    """The runs lack what a claim is about, such as a stage; the message says what."""
+
+
+def _at(variant: Variant, metric: str, stage: int, row: int = -1) -> np.ndarray:
+    """A metric at a row of a stage, the last one by default, (S,)."""
+    rows = np.flatnonzero(variant.stage == stage)
+    if not len(rows):
+        raise NotMeasurable(f"{variant.name} has no stage {stage}")
+    return variant.metrics[metric][:, rows[row]]
+
+
+def _residual(variant: Variant, start: int, end: int) -> np.ndarray:
+    """The change of |residual at s0| between two stages' ends, (S,)."""
+    before, after = (abs(_at(variant, "residual_start", n)) for n in (start, end))
+    return after - before
+
+
+def _before_target(variant: Variant, metric: str) -> np.ndarray:
+    """Mean over the later stages' ends before the target, (S,): T5 to T9 of ten."""
+    n = int(variant.stage[-1])
+    if n == 1:
+        raise NotMeasurable(f"{variant.name} has one stage only")
+    return np.mean([_at(variant, metric, k) for k in range(max(1, n // 2), n)], axis=0)
+
+
+def _gap(variant: Variant) -> np.ndarray:
+    """Last return − V*(s0), (S,)."""
+    if variant.optimum is None:
+        raise NotMeasurable("the runs do not record one optimum")
+    return variant.last("return") - variant.optimum
+
+
+#: What is measured of a variant: (S,) values, or hits to be counted.
+MEASURES = {
+    "error": lambda v: v.last("q_error"),
+    "return": lambda v: v.last("return"),
+    "deviation of return": lambda v: v.last("return"),
+    "solved": lambda v: v.last("solved") > 0,
+    "error from T1 to T2": lambda v: _at(v, "q_error", 2, 0) - _at(v, "q_error", 1),
+    "error within T3": lambda v: _at(v, "q_error", 3) - _at(v, "q_error", 3, 0),
+    "error after T2": lambda v: _at(v, "q_error", 2),
+    "error before the target": lambda v: _before_target(v, "q_error"),
+    "solved before the target": lambda v: _before_target(v, "solved"),
+    "optimal": lambda v: _gap(v) >= -_OPTIMAL,
+    "nearly optimal": lambda v: _gap(v) / abs(v.optimum) + _NEAR,
+    "residual from T1 to T6": lambda v: _residual(v, 1, 6),
+    "residual from T6 to T7": lambda v: _residual(v, 6, 7),
+    "residual from T7 to T10": lambda v: _residual(v, 7, 10),
+    "late return": lambda v: v.late("return"),
+}
+_STATISTICS = {"deviation of return": np.std}  # of others the mean over seeds
+
+_DATA = yaml.safe_load(Path(__file__).with_name("claims.yaml").read_text("utf-8"))
+_TITLES: dict[str, str] = _DATA["titles"]  # by environment
+#: Environment, family → statement → quantity, what is expected of it, and of whom.
+CLAIMS: dict[tuple[str, ...], dict[str, list[str]]] = {
+    tuple(pair.split(", ")): found for pair, found in _DATA["claims"].items()
+}
+
+
+def claims_report(runs: Runs, tag: str | None = None) -> str:
+    """The Markdown document: per environment the claims and the values behind them."""
+    tagged = f", variants @{tag}" if tag else ""
+    notes = runs.notes_on(tag)
+    parts = [f"# The paper's claims, scale {runs.scale}{tagged}\n"]
+    if lacking := incomplete(notes):
+        parts.append(f"**{lacking}**\n")
+    sections = claims_sections(runs, tag).values()
+    parts += [TEXTS["claims"], TEXTS["glossary"], *map(str, sections)]
+    if notes:
+        parts += ["## Notes on the runs\n", *(f"- {note.text}" for note in notes), ""]
+    return "\n".join(parts)
+
+
+def claims_sections(runs: Runs, tag: str | None) -> dict[tuple[str, str], Section]:
+    """(environment, family) of the paper's → its claims and the values behind them."""
+    found = {}
+    for (env, family), claims in CLAIMS.items():
+        methods = runs.methods(env, tag, family)
+        if not methods:
+            found[env, family] = Section(_TITLES[env], ["No runs.\n"])
+            continue
+        variants = methods.values()
+        parts: list[str | TextTable] = []
+        if len({variant.tag for variant in variants}) > 1:
+            parts.append(f"{tags_shown(methods)}; the others are untagged.\n")
+        rows = [_judged(text, claim, methods) for text, claim in claims.items()]
+        # Reasons are left aside.
+        verdicts = Counter(re.split(r" \(|:", row["verdict"])[0] for row in rows)
+        counted = ", ".join(f"{n} {verdict}" for verdict, n in verdicts.most_common())
+        seconds = sum(variant.cpu_seconds for variant in variants)
+        parts += [f"{len(rows)} claims: {counted}.\n", TextTable(rows)]
+        parts += _values(variants)
+        parts.append(f"CPU time of these runs: {tables.duration(seconds)}.\n")
+        found[env, family] = Section(_TITLES[env], parts)
+    return found
+
+
+def _judged(statement: str, claim: list[str], runs: Methods) -> dict[str, str]:
+    """A claim, what was measured of `runs`, and the verdict: a table's row."""
+    quantity, expect, *names = claim
+    absent = [name for name in names if name not in runs]
+    used = [runs[name] for name in names if name in runs]
+    counts = [len(variant.seeds) for variant in used]
+    shown, decided = ABSENT, f"no runs of {listed(absent)}" if absent else ""
+    try:
+        if not absent:
+            value, interval, detail = _measured(quantity, used)
+            shown = tables.estimate(value, interval) + detail
+            decided = verdict(value, interval, expect, min(counts))
+    except NotMeasurable as reason:
+        decided = f"not measurable: {reason}"
+    words = f"{_DATA['quantities'][quantity]}: {' − '.join(names)}"
+    return {
+        "claim": statement,
+        "quantity: method, or difference of two": words,
+        "expected": expect,
+        "estimate [95 % interval]": shown,
+        "seeds": " / ".join(map(str, dict.fromkeys(counts))) or "0",
+        "verdict": decided,
+    }
+
+
+def _measured(quantity: str, variants: list[Variant]) -> tuple[float, Interval, str]:
+    """An estimate, its interval, and the counts of seeds if it is of shares."""
+    values = [MEASURES[quantity](variant) for variant in variants]
+    statistic = _STATISTICS.get(quantity, np.mean)
+    first, *rest = (float(statistic(each)) for each in values)
+    value = first - rest[0] if rest else first
+    if values[0].dtype != bool:
+        return value, statistics.bootstrap(*values, statistic=statistic), ""
+    (hits, n), *others = counts = [(int(v.sum()), len(v)) for v in values]
+    if not others:
+        return value, statistics.share_interval(hits, n), f" ({hits} of {n} seeds)"
+    shown = " against ".join(f"{k}/{n}" for k, n in counts)
+    interval = statistics.share_difference_interval(hits, n, *others[0])
+    return value, interval, f" ({shown})"
+
+
+def verdict(value: float, interval: Interval, expect: str, seeds: int) -> str:
+    """`holds`, `does not hold` or `undecided`, with the reason for no verdict."""
+    if not np.isfinite(value):
+        return "undecided (non-finite values)"
+    if seeds < FEWEST_SEEDS:
+        return f"undecided (fewer than {FEWEST_SEEDS} seeds)"
+    low, high = interval
+    holds, fails = {
+        "= 0": (value == 0, value != 0),
+        "> ½": (low > 0.5, high <= 0.5),
+        "> 0": (low > 0, high <= 0),
+        "< 0": (high < 0, low >= 0),
+        "≤ 0": (high <= 0, low > 0),
+    }[expect]
+    return "holds" if holds else "does not hold" if fails else "undecided"
+
+
+def _values(variants: Iterable[Variant]) -> list[str | TextTable]:
+    """What every method reaches, and metrics of FQI at every stage's end."""
+    common = set.intersection(*(set(v.metrics) for v in variants))
+    rows = []
+    for variant in variants:
+        n, measured = len(variant.seeds), _reached(variant)
+        seeds = tables.seeds_cell(n, len(variant.failed))
+        row = {"method": variant.name, "seeds": seeds}
+        for name, values in measured.items():
+            row[name] = tables.estimate(values.mean(), statistics.bootstrap(values))
+        for name in ("q_error", "q_error_start", "return", "late return"):
+            if name in measured:
+                row[f"{name}, IQM"] = number(stats.trim_mean(measured[name], 0.25))
+        if "solved" in common:
+            hits = int((variant.last("solved") > 0).sum())
+            low, high = map(number, statistics.share_interval(hits, n))
+            row["seeds solving the target"] = f"{hits}/{n} [{low}, {high}]"
+        rows.append(row)
+    parts: list[str | TextTable] = [TEXTS[variant.family], TextTable(rows)]
+    columns = [f"stage {k + 1}" for k in range(max(v.stage[-1] for v in variants))]
+    for metric in (name for name in _AT_ENDS if name in common):
+        rows = []
+        for variant in variants:
+            row, values = {"method": variant.name}, variant.metrics[metric]
+            row |= dict.fromkeys(columns, ABSENT)
+            for at in np.flatnonzero(np.diff(variant.stage, append=0)):
+                row[f"stage {variant.stage[at]}"] = number(values[:, at].mean())
+            rows.append(row)
+        parts += [f"{_AT_ENDS[metric]} at every stage's end:\n", TextTable(rows)]
+    return parts
+
+
+def _reached(variant: Variant) -> dict[str, np.ndarray]:
+    """Columns of the values' table, (S,) each."""
+    if variant.family == "FQI":
+        names = ("q_error", "q_error_start", "return")
+        return {name: variant.last(name) for name in names if name in variant.metrics}
+    return {
+        "last return": variant.last("return"),
+        "late return": variant.late("return"),
+        "last discounted return": variant.last("discounted_return"),
+        "late success rate": variant.late("success_rate"),
+        "late greedy return": variant.late("greedy_return"),
+        "area": variant.area("return"),
+    }

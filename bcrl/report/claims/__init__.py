@@ -1,1 +1,0 @@
-"""The paper's claims, each with the quantity that decides it and a verdict."""
