@@ -11,6 +11,7 @@ from typing import Any
 
 import yaml
 from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
@@ -51,7 +52,7 @@ def now(pattern: str) -> str:
 
 def register_plugins() -> None:
     """Make the schema known to Hydra, and how folders of configs are read."""
-    schema.register_schema()
+    ConfigStore.instance().store(name="schema", node=schema.Config)
     for plugin in (safety.ConfigFolder, safety.OwnSearchPath):
         Plugins.instance().register(plugin)
     OmegaConf.register_new_resolver("now", now, replace=True)
@@ -60,7 +61,7 @@ def register_plugins() -> None:
 def searchpath(folders: Paths) -> list[str]:
     """The override that adds folders to Hydra's search path, if there are any."""
     quoted = [folder.replace("'", r"\'") for folder in folders]
-    places = [f"'{safety.ConfigFolder.scheme()}://{folder}'" for folder in quoted]
+    places = [f"'bcrl://{folder}'" for folder in quoted]
     return [f"hydra.searchpath=[{','.join(places)}]"] if folders else []
 
 
@@ -116,19 +117,14 @@ def first_lines(error: BaseException) -> str:
     return text if key in text else f"{key}: {text}"
 
 
-def options(group: str, folders: Paths = ()) -> list[str]:
-    """The names of a group's options, ours and those of other folders."""
-    files = (Path(folder, group).glob("*.yaml") for folder in (str(CONF), *folders))
-    return sorted({path.stem for each in files for path in each}, key=str.lower)
-
-
-def group_names(folders: Paths = ()) -> list[str]:
-    """The names of all groups, `env` and `algorithm/regressor` among them."""
-    found: set[str] = set()
+def catalog(folders: Paths = ()) -> dict[str, list[str]]:
+    """The options of each group, `algorithm/regressor` among them, of all folders."""
+    found: dict[str, set[str]] = {}
     for folder in (CONF, *map(Path, folders)):
-        paths = (*folder.glob("*/*.yaml"), *folder.glob("*/*/*.yaml"))
-        found |= {path.parent.relative_to(folder).as_posix() for path in paths}
-    return sorted(found)
+        for path in (*folder.glob("*/*.yaml"), *folder.glob("*/*/*.yaml")):
+            group = path.parent.relative_to(folder).as_posix()
+            found.setdefault(group, set()).add(path.stem)
+    return {group: sorted(found[group], key=str.lower) for group in sorted(found)}
 
 
 @cache

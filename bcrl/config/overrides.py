@@ -18,9 +18,9 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
 from bcrl.common.terminal import say
-from bcrl.config.hydra_compose import Paths, first_lines, group_names, now, options
+from bcrl.config.hydra_compose import Paths, catalog, first_lines, now
 from bcrl.config.safety import check_override
-from bcrl.config.schema import section_of_seeds, texts
+from bcrl.config.schema import TEXTS, section_of_seeds
 from bcrl.errors import BcrlError, ConfigError
 
 JOBS = 1_000  # of one sweep
@@ -38,9 +38,9 @@ def parse(overrides: Sequence[str]) -> list[Override]:
         try:
             parsed += parser.parse_overrides([override])
         except (HydraException, ValueError) as error:  # a number of 5000 digits
-            key, _, value = override.partition("=~")
-            home = f"; did you mean {key}=$HOME{value}?" if value else ""
-            text = f"{override!r} can't be read as KEY=VALUE{home}"
+            home = override.replace("=~", "=$HOME")
+            meant = f"; did you mean {home}?" if home != override else ""
+            text = f"{override!r} can't be read as KEY=VALUE{meant}"
             raise BcrlError(text) from error
     return parsed
 
@@ -74,7 +74,7 @@ def _canonical(text: str, folders: Paths) -> Iterator[str]:
     (override,) = parse([text])
     key, value = override.key_or_group, override.value()
     head, equals, raw = text.partition("=")
-    is_group = key in group_names(folders)
+    known = catalog(folders).get(key, [])  # a group's options
     swept = isinstance(value, types.ChoiceSweep)
     values: list[Any] = value.list if swept else [value]  # type: ignore[union-attr]
     if override.is_delete() or not equals:
@@ -88,21 +88,18 @@ def _canonical(text: str, folders: Paths) -> Iterator[str]:
             those = [str(section[name]).replace(" ", "") for section in sections]
             yield f"seeds.{name}={'null' if those[0] == 'None' else ','.join(those)}"
     elif isinstance(value, types.Glob):
-        known = options(key, folders) if is_group else ["no group"]
-        names = value.filter(known) if is_group else []
+        names = value.filter(known)
         if not names:
             why = f"glob(…) picks options of a group; {key} has {', '.join(known)}"
             raise ConfigError(key, raw, why)
         yield from _canonical(f"{head}={','.join(names)}", folders)
-    elif COMPUTED.match(raw) or (is_group and isinstance(value, list)):
-        yield text
-    elif is_group or key in texts() or key.endswith((".name", ".id")):
+    else:
+        is_text = known or key in TEXTS or key.endswith((".name", ".id"))
         written = CHOICE.sub(r"\1\2", raw).split(",") if swept else [raw]
-        if len(written) == len(values):
+        kept = COMPUTED.match(raw) or (known and isinstance(value, list))
+        if is_text and not kept and len(written) == len(values):
             each = (_as_text(w, v, key) for w, v in zip(written, values, strict=True))
             text = f"{head}={','.join(each)}"
-        yield text
-    else:
         yield text
 
 

@@ -12,6 +12,7 @@ from numbers import Integral, Real
 from typing import Any, cast
 
 from bcrl.common.checks import one_of
+from bcrl.common.identity import Plain
 from bcrl.config.variant import Composition
 from bcrl.envs import Env, is_finite
 from bcrl.errors import ConfigError
@@ -23,25 +24,18 @@ from bcrl.learning.transfer import Boost, Shape, StageInit, warm_start
 from bcrl.q.functions import ZERO
 from bcrl.q.quadratic import FEATURES
 
-_COUNTS = (
-    *("iterations", "episodes", "steps", "target_update", "batch_size", "replay_size"),
-    *("evaluate_every", "evaluation_episodes", "lockstep", "workers", "threads"),
-    *("max_iterations", "max_episodes", "max_steps"),
-)
-_STEPS = ("random_steps", "learning_starts", "anneal_steps")
-_PROBABILITIES = ("epsilon", "epsilon_start", "evaluation_epsilon")
-_POSITIVE = ("learning_rate", "noise_std", "checkpoint_every")
 ABOVE_0 = math.nextafter(0.0, 1.0)
-#: A setting's type, its least and its greatest value.
-BOUNDS = {
-    **dict.fromkeys(_COUNTS, (Integral, 1, math.inf)),
-    **dict.fromkeys(_STEPS, (Integral, 0, math.inf)),
-    **dict.fromkeys(_PROBABILITIES, (Real, 0, 1)),
-    **dict.fromkeys(_POSITIVE, (Real, ABOVE_0, math.inf)),
-    **{"first": (Integral, 0, 2**32), "count": (Integral, 1, 10**6)},
-}
-#: What FQI knows of shaping: none, or the paper's.
-SHAPES = (None, Shape())
+#: A type, the least and the greatest value, and the settings that have them.
+BOUNDS: tuple[tuple[Any, float, float, str], ...] = (
+    (Integral, 1, math.inf, "iterations episodes steps target_update batch_size"),
+    (Integral, 1, math.inf, "replay_size evaluate_every evaluation_episodes lockstep"),
+    (Integral, 1, math.inf, "workers threads max_iterations max_episodes max_steps"),
+    (Integral, 0, math.inf, "random_steps learning_starts anneal_steps"),
+    (Real, 0, 1, "epsilon epsilon_start evaluation_epsilon"),
+    (Real, ABOVE_0, math.inf, "learning_rate noise_std checkpoint_every"),
+    (Integral, 0, 2**32, "first"),
+    (Integral, 1, 10**6, "count"),
+)
 #: Settings that a warm start passes on, so that they can't differ between slots.
 PASSED_ON = {FQI: ("regressor",), DQN: ("hidden", "learning_rate")}
 
@@ -51,7 +45,8 @@ def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...
 
     One stage per slot. Plain DQN has one in all, with the steps of all slots and the
     other settings of the last: its networks, task and replay stay the same. Raises
-    ConfigError for what can't be learned, or would have no effect.
+    ConfigError for what can't be learned, or would have no effect. The composition's
+    scale caps the budgets in the end.
     """
     chosen.check()
     _check(chosen, learners)
@@ -72,21 +67,19 @@ def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...
         if isinstance(learner, DQN) and made and has_policy:
             learner = replace(learner, random_steps=0)
         made.append(Stage(number, task + 1, env, learner, chosen.transfers, 0))
-    return _placed(made)
+    ready = [_capped(stage.learner, chosen.scale) for stage in made]
+    before = accumulate((learner.length for learner in ready), initial=0)
+    each = zip(made, ready, before, strict=False)
+    return tuple(replace(stage, learner=x, before=n) for stage, x, n in each)
 
 
-def capped(
-    stages: Sequence[Stage], kind: type[FQI] | type[DQN], **most: int | None
-) -> tuple[Stage, ...]:
-    """The stages with a scale's caps on the budgets of one kind of learner."""
-    made = []
-    for stage in stages:
-        learner = stage.learner
-        if isinstance(learner, kind):
-            caps = {k: min(getattr(learner, k), cap) for k, cap in most.items() if cap}
-            learner = replace(learner, **caps)
-        made.append(replace(stage, learner=learner))
-    return _placed(made)
+def _capped(learner: Learner, scale: Plain) -> Learner:
+    """A learner of ours with a scale's caps on its budget, which LSPI has none of."""
+    if not isinstance(learner, FQI | DQN):
+        return learner
+    caps = {k: scale.get(f"max_{k}") for k in ("iterations", "episodes", "steps")}
+    own = vars(learner).items()
+    return replace(learner, **{k: min(v, caps[k]) for k, v in own if caps.get(k)})
 
 
 def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
@@ -119,9 +112,7 @@ def _check_fqi(chosen: Composition, learner: FQI, env: Env, start: StageInit) ->
     regressor, why = learner.regressor, ""
     key, value = "algorithm.regressor", cast(Any, regressor)
     if isinstance(regressor, type) or not hasattr(regressor, "finite_only"):
-        why = (
-            "is no regressor of bcrl's; Sklearn(estimator) makes one of scikit-learn's"
-        )
+        why = "is no regressor of ours; Sklearn(estimator) makes one of scikit-learn's"
     elif regressor.finite_only and not is_finite(env):
         why = f"needs finitely many states, which {env.name} has not"
     elif learner.shared_data and learner.epsilon < 1:
@@ -130,7 +121,7 @@ def _check_fqi(chosen: Composition, learner: FQI, env: Env, start: StageInit) ->
     elif chosen.boost and start.boost != Boost():
         key, value = "boosting", chosen.boost
         why = "is the released DQN's; FQI learns with the paper's, boosting=on"
-    elif (start.behavior, start.boost) != (None, Boost()) or start.shape not in SHAPES:
+    elif start.behavior or (start.boost, start.shape or Shape()) != (Boost(), Shape()):
         key, value = "transfer", chosen.transfer
         why = "is for algorithm=dqn; FQI learns with transfer=shaping, or without one"
     if why:
@@ -180,15 +171,16 @@ def check_lspi(learner: LSPI) -> None:
 
 def check_numbers(section: str, values: Mapping[str, Any]) -> None:
     """Raise ConfigError for a setting out of its bounds."""
-    for name, (kind, least, most) in BOUNDS.items():
-        value = values.get(name, least)
-        fits = isinstance(value, kind) and not isinstance(value, bool)
-        if not fits or not least <= value <= most or value == math.inf:
-            noun = "an integer" if kind is Integral else "a number"
-            bounds = f"of at least {least}" if least != ABOVE_0 else "above 0"
-            bounds = f"from {least} to {most}" if most < math.inf else bounds
-            key = f"{section}.{name}".lstrip(".")
-            raise ConfigError(key, value, f"must be {noun} {bounds}")
+    for kind, least, most, names in BOUNDS:
+        for name in (each for each in names.split() if each in values):
+            value = values[name]
+            fits = isinstance(value, kind) and not isinstance(value, bool)
+            if not fits or not least <= value <= most or value == math.inf:
+                noun = "an integer" if kind is Integral else "a number"
+                bounds = f"of at least {least}" if least != ABOVE_0 else "above 0"
+                bounds = f"from {least} to {most}" if most < math.inf else bounds
+                key = f"{section}.{name}".lstrip(".")
+                raise ConfigError(key, value, f"must be {noun} {bounds}")
 
 
 def _with_data(learner: FQI, env: Env, before: Sequence[Stage]) -> FQI:
@@ -200,9 +192,3 @@ def _with_data(learner: FQI, env: Env, before: Sequence[Stage]) -> FQI:
         why = "the task's data are kept, so epsilon and episodes must stay the same"
         raise ConfigError("algorithm.new_data", "task", why)
     return learner
-
-
-def _placed(stages: Sequence[Stage]) -> tuple[Stage, ...]:
-    """Stages whose `before` counts what the ones before them take."""
-    lengths = accumulate((stage.learner.length for stage in stages), initial=0)
-    return tuple(replace(s, before=n) for s, n in zip(stages, lengths, strict=False))

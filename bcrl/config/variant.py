@@ -73,8 +73,7 @@ class Composition:
         elif residual and getattr(self.tasks[-1], "actions", None) is None:
             why = "combines actions as vectors, which env.action_vectors has to name"
         elif residual and start.base is not ZERO:
-            why = "learns the Q-values of its own actions, but a base has those of the "
-            why += "executed actions: boosting=off"
+            why = "learns Q of its own actions, a base of executed ones: boosting=off"
         if why:
             raise ConfigError("transfer", transfer, why)
         for key, one in (("transfer", transfer), ("boosting", boost)):
@@ -106,8 +105,6 @@ def order_of(curriculum: object, tasks: Sequence[Env]) -> tuple[int, ...]:
     ordered: Any = curriculum
     if isinstance(curriculum, str) and "." in curriculum:
         ordered = plugins.attribute("curriculum.name", curriculum, curriculum)
-        if not callable(ordered):
-            raise ConfigError("curriculum.name", curriculum, "must be a function")
     elif not callable(curriculum):
         one_of("curriculum.name", curriculum, list(CURRICULA))
         ordered = CURRICULA[str(curriculum)]
@@ -115,15 +112,14 @@ def order_of(curriculum: object, tasks: Sequence[Env]) -> tuple[int, ...]:
         found, again = ordered(n), ordered(n)
         order = tuple(map(operator.index, found))
         whole = isinstance(found, list | tuple | range) and bool not in map(type, found)
-        fits = whole and len(order) == n and {n - 1} <= set(order) <= set(range(n))
+        fits = len(order) == n and {n - 1} <= set(order) <= set(range(n))
         same = list(found) == list(again)
     except Exception as error:  # whatever a function of the user's does
         why = f"failed for {n} tasks: {type(error).__name__}: {error}"
         raise ConfigError("curriculum", curriculum, why) from error
-    if not fits or not same:
-        why = f"visits {found!r:.80}" + f", then {again!r:.80}" * (not same)
-        why += f", but must always return one list of {n} integers from 0 to {n - 1}, "
-        why += f"one per slot, with the target, {n - 1}, among them"
+    if not (whole and fits and same):
+        why = f"visits {found!r:.80}, but must always return the same list of {n} "
+        why += f"integers from 0 to {n - 1}, with the target, {n - 1}, among them"
         raise ConfigError("curriculum", curriculum, why)
     return order
 

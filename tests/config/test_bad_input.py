@@ -71,15 +71,9 @@ def test_what_names_a_directory_is_a_plain_word(tmp_path):
         ("variant: BC", "defaults: [override /variant: …]"),
         ("seed: 2\nseeds: 3", "seed=2; seeds"),
         ("scale: {name: 7}", "scale.name=7"),
-        # Sweeps that Hydra reads otherwise.
-        ("SWEEP tag: '1e3,2e3'", '"1e3","2e3"'),
-        ("SWEEP seed: '1,2'", "seeds.only: '[1],[2]'"),
-        ("SWEEP boosting: glob(o*)", "boosting: 'off,on'"),
     ],
 )
 def test_a_users_yaml_is_checked_too(text, said, tmp_path):
-    swept = "hydra: {mode: MULTIRUN, sweeper: {params: {%s}}}"
-    text = swept % text[6:] if text.startswith("SWEEP") else text
     with pytest.raises(BcrlError) as error:
         plans(MAZE, "experiment=mine", config_dir=own(tmp_path, text))
     for words in said.split("; "):

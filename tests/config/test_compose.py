@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from bcrl.config.hydra_compose import CONF, options
+from bcrl.config.hydra_compose import CONF, catalog
 from bcrl.errors import BcrlError
 from bcrl.learning.curriculum import CURRICULA
 from bcrl.learning.dqn import DQN
@@ -131,7 +131,7 @@ def sensible(algorithm: str, curriculum: str, boosting: str, transfer: str) -> b
 def test_every_combination_composes_or_is_rejected_with_a_reason(algorithm):
     """The rule book's test (test_rule_book.py) has all envs without composing."""
     groups, names = ("curriculum", "boosting", "transfer"), {}
-    for chosen in itertools.product(*map(options, groups)):
+    for chosen in itertools.product(*(catalog()[group] for group in groups)):
         words = [f"{group}={o}" for group, o in zip(groups, chosen, strict=True)]
         ended = outcome("env=linear_system", f"algorithm={algorithm}", *words)
         assert (ended != "rejected") == sensible(algorithm, *chosen), chosen
@@ -143,8 +143,8 @@ def test_every_combination_composes_or_is_rejected_with_a_reason(algorithm):
 
 @pytest.mark.slow
 def test_every_experiment_composes_at_every_scale():
-    for experiment in options("experiment"):
-        for scale in options("scale"):
+    for experiment in catalog()["experiment"]:
+        for scale in catalog()["scale"]:
             assert outcome(f"experiment={experiment}", f"scale={scale}") != "rejected"
 
 

@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 
 from bcrl import cli
 from bcrl.common.identity import flat
-from bcrl.config.hydra_compose import composed, group_names, options
+from bcrl.config.hydra_compose import catalog, composed
 from bcrl.run import runner
 
 EXAMPLES = int(os.environ.get("BCRL_FUZZ", "90"))
@@ -83,7 +83,9 @@ def keys() -> list[str]:
     return sorted(found)
 
 
-CHOICES = [f"{group}={option}" for group in group_names() for option in options(group)]
+CHOICES = [
+    f"{group}={option}" for group, names in catalog().items() for option in names
+]
 TEXT = st.text(st.one_of(st.characters(), st.characters(categories=["Cs"])), max_size=8)
 CALL = "{_target_: os.system, command: touch canary}"
 BAD = (
@@ -122,7 +124,7 @@ KEYS = st.deferred(lambda: st.sampled_from(keys()))
 @st.composite
 def overrides(draw):
     """One override, most likely bad."""
-    key = draw(st.one_of(KEYS, st.sampled_from(group_names())))
+    key = draw(st.one_of(KEYS, st.sampled_from(list(catalog()))))
     last = draw(st.sampled_from(["_target_", "_args_", "x", "()", "a.b"]))
     section = key.rpartition(".")[0] or "hydra"
     whole = draw(

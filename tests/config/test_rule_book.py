@@ -11,8 +11,7 @@ import pytest
 from bcrl import api
 from bcrl.config import jobs
 from bcrl.config import plan as compose
-from bcrl.config.hydra_compose import composed, read_option
-from bcrl.config.hydra_compose import options as names
+from bcrl.config.hydra_compose import catalog, composed, read_option
 from bcrl.errors import ConfigError
 from bcrl.learning.curriculum import CURRICULA
 from bcrl.learning.lspi import LSPI
@@ -35,7 +34,7 @@ from tests.toys import OpenCorridor
 
 def options(group: str) -> dict[str, dict]:
     """The options of a group, by name, as their files say."""
-    return {name: read_option(group, name) for name in names(group)}
+    return {name: read_option(group, name) for name in catalog()[group]}
 
 
 #: The choices besides env and algorithm; an option added to conf/ is covered, too.
