@@ -70,13 +70,12 @@ def flag_parser() -> argparse.ArgumentParser:
     """Hydra's flags and ours."""
     result = get_args_parser()
     result.prog = "bcrl"
-    shown = next(a for a in result._actions if "--version" in a.option_strings)
-    shown.version, shown.help = f"bcrl {__version__}", "show bcrl's version"  # type: ignore
-    about = "explain a key or group; without KEY, list all keys"
-    result.add_argument("--describe", metavar="KEY", nargs="?", const="", help=about)
-    result.add_argument("--dry-run", action="store_true", help="list jobs and costs")
-    result.add_argument("--runs-dir", metavar="PATH", help="as runs_dir=PATH")
-    result.add_argument("--status", action="store_true", help="list what is done")
+    shown: Any = result._option_string_actions["--version"]
+    shown.version = f"bcrl {__version__}"
+    result.add_argument("--describe", nargs="?", const="")
+    result.add_argument("--dry-run", action="store_true")
+    result.add_argument("--runs-dir")
+    result.add_argument("--status", action="store_true")
 
     def reject(message: str) -> NoReturn:
         raise BcrlError(f"{message}; see bcrl --help")
@@ -122,13 +121,12 @@ def completions(line: str) -> list[str]:
         typed, _ = flags.parse_known_intermixed_args(words)
     except BcrlError:  # a flag's own argument is missing: the shell proposes files
         return []
-    folder = _folder(typed)
-    folders = (folder,) if folder else ()
-    key, equals, _ = word.partition("=")
+    folders = tuple(filter(None, [_folder(typed)]))
     groups = catalog(folders)
+    key, equals, begun = word.partition("=")
     if equals:
-        found = [f"{key}={option}" for option in groups.get(key, ())]
-        return [each for each in found if each.startswith(word)]
+        found = [each for each in groups.get(key, ()) if each.startswith(begun)]
+        return [f"{key}={each}" for each in found]
     chosen = any(o.startswith(("env=", "experiment=")) for o in typed.overrides)
     # Without an env nothing composes; most keys are the same in all of them.
     overrides = [o for o in typed.overrides if not o.startswith("hydra.")]

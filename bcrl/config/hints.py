@@ -144,13 +144,12 @@ class Hints:
         raw = str(override.input_line).partition("=")[2]
         group, is_text = key.replace(".", "/"), isinstance(value, str)
         if override.is_delete():
-            why = "can't be deleted: every run needs a choice of it, or its default"
-            return why if key in Config.__annotations__ else None
+            needed = key in Config.__annotations__
+            return "every run needs a choice of it, or its default" if needed else None
         if key in self.groups and not isinstance(value, str | Sweep | Glob):
             return f"name one option, or leave {key} out; {self.of_option(key, value)}"
         if key in OPTIONAL and isinstance(value, str | Sweep):
-            names = [value] if is_text else override.sweep_string_iterator()
-            for name in names:
+            for name in [value] if is_text else override.sweep_string_iterator():
                 if name not in self.groups.get(key, ()):
                     return f"there is no {name}; {self.of_option(key, name)}"
         seeds = key in ("seed", "seeds") and (is_text or isinstance(value, RangeSweep))
@@ -173,11 +172,10 @@ class Hints:
 
     def swept(self) -> str:
         """What to say of several values without -m."""
-        override = next(o for o in parse(self.overrides) if o.is_sweep_override())
-        first, line = override.input_line, shlex.join(["bcrl", "-m", *self.overrides])
-        if override.key_or_group.startswith("seed"):  # more likely one run of them
-            meant = numbers("seeds", str(first))
-            return f"{first}: did you mean {meant}? If a sweep: {line}"
+        swept = (o.input_line for o in parse(self.overrides) if o.is_sweep_override())
+        first, line = str(next(swept)), shlex.join(["bcrl", "-m", *self.overrides])
+        if first.startswith("seed"):  # more likely one run of them
+            return f"{first}: did you mean {numbers('seeds', first)}? A sweep: {line}"
         return f"{first}: several values are a sweep; add -m: {line}"
 
     def explained(self, error: compose.Unknown) -> str:
@@ -195,27 +193,21 @@ class Hints:
         typed = [o for o in self.overrides if o.lstrip("+~").startswith(key)]
         value = typed[-1].partition("=")[2] if typed else ""
         if file := re.match(r"In '([^']*)'", str(error)):
-            near = (self.line(key, "") or "").split(" ")[-1].partition("=")[0]
+            near = (self.line(key, "") or key).split(" ")[-1].partition("=")[0]
             nested = near.replace(".", ": {") + ": …" + "}" * near.count(".")
-            if key in self.groups:
-                nested = f"defaults: [override /{key}: …]"
-            meant = f"did you mean {nested}?" if near else "see bcrl --help"
-            return f"{key}: unknown key in {file[1]}; {meant}"
+            nested = f"defaults: [override /{key}: …]" if key in self.groups else nested
+            return f"{key}: unknown key in {file[1]}; did you mean {nested}?"
         if key in self.groups:
-            why = "needs no +" if typed[-1][0] == "+" else "is chosen twice"
-            return f"{key}: {why}; {self.mean(key, value)}"
+            return f"{key}: needs no +, and is chosen once; {self.mean(key, value)}"
         if typed and typed[0].startswith("~"):
             return f"{typed[0]}: there is nothing to delete; {key}=null"
-        for parent, there in self.present.items():
-            if key.startswith(f"{parent}.") and there is None:
-                why = f"unknown key, for {parent} is null"
-                return f"{key}: {why}; did you mean +{key}={value}?"
-        return f"{key}: unknown key; {self.mean(key, value)}"
+        nulls = (f"{k}." for k, there in self.present.items() if there is None)
+        added = f"did you mean +{key}={value}?" if key.startswith(tuple(nulls)) else ""
+        return f"{key}: unknown key; {added or self.mean(key, value)}"
 
     def of_option(self, group: str, value: object) -> str:
         """`did you mean env=maze?`, and the options."""
-        near = self._choice(group, value)
-        known = ", ".join(self.groups.get(group, ())) or "none"
+        near, known = self._choice(group, value), ", ".join(self.groups.get(group, []))
         return f"did you mean {near}? (known: {known})" if near else f"known: {known}"
 
     def mean(self, word: str, value: str | None) -> str:

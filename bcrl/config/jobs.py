@@ -23,9 +23,8 @@ from bcrl.config.plan import Plan
 from bcrl.config.schema import VARIANT_GROUPS
 from bcrl.errors import BcrlError, ConfigError, guess
 
-#: The options that follow the authors' code, and the tag of runs that choose them all.
-RELEASED = "released"
-RELEASED_OPTIONS = {"boosting=on": "released", "transfer=shaping": "shaping_released"}
+#: The options that follow the authors' code, all of them with the tag `released`.
+RELEASED = {"boosting=on": "released", "transfer=shaping": "shaping_released"}
 #: The env that a command completes by an id, after which its results are named.
 OPEN = "gymnasium"
 
@@ -164,20 +163,19 @@ def _command(hydra: DictConfig, folders: Paths, launched: bool) -> str:
 def _tag(config: Plain, hydra: DictConfig, folders: Paths) -> str | None:
     """What names a run besides its variant: its tag, `released`, or a digest.
 
-    The config is compared with the shipped options that have its components' names (a
-    user's option `big` that is named fqi with our fqi), in the paper's reading, which
-    needs no tag, and in that of the authors' code.
+    The config is compared with the shipped options that have its components' names, in
+    the paper's reading, which needs no tag, and in that of the authors' code.
     """
     if config["tag"] is not None:
         return config["tag"]
     choices = hydra.runtime.choices
-    usual: dict[str | None, dict[str, str]] = {None: {}, RELEASED: {}}
+    usual: dict[str | None, dict[str, str]] = {None: {}, "released": {}}
     for tag, group in itertools.product(usual, VARIANT_GROUPS[1:]):
         name = config[group].get("name")
         if group in ("curriculum", "boosting"):
             name = "off" if name == "off" else "on"
-        if tag == RELEASED:
-            name = RELEASED_OPTIONS.get(f"{group}={name}", name)
+        if tag:
+            name = RELEASED.get(f"{group}={name}", name)
         shipped = (CONF / group / f"{name}.yaml").exists()
         usual[tag][group] = name if shipped else choices[group]
     if not folders and _only_chooses(hydra):

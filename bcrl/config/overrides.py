@@ -1,7 +1,6 @@
-"""The overrides of a command line: parsed, written as they are meant, one by one.
+"""The overrides of a command line: parsed, and written as they are meant.
 
-Hydra guesses types: `tag=1e3` would be 1000.0. Here a name stays what was typed,
-`seeds=5`, `seeds=[3,7]` and `seed=3` become keys, a folder outside becomes absolute.
+Hydra guesses types: `tag=1e3` would be 1000.0. Here a name stays what was typed.
 """
 
 import math
@@ -118,11 +117,10 @@ def product(overrides: Sequence[Override]) -> list[list[str]]:
     jobs = 1.0
     for override in overrides:
         sweep = override.value()
+        why = f"a sweep of more than {JOBS} jobs, or of none"
         if isinstance(sweep, types.IntervalSweep):
-            line = f"-m {override.key_or_group}=0.1,0.5"
-            why = f"an interval can't be swept over; did you mean {line}?"
-            raise BcrlError(f"{override.input_line}: {why}")
-        if isinstance(sweep, types.ChoiceSweep):
+            jobs, why = 0, f"no interval; did you mean {override.key_or_group}=0.1,0.5?"
+        elif isinstance(sweep, types.ChoiceSweep):
             jobs *= len(sweep.list)
         elif isinstance(sweep, types.RangeSweep):
             try:
@@ -130,7 +128,6 @@ def product(overrides: Sequence[Override]) -> list[list[str]]:
             except (ArithmeticError, TypeError):  # a step of 0, a number out of range
                 jobs = math.inf
         if not 0 < jobs <= JOBS:
-            why = f"a sweep of more than {JOBS} jobs, or of none"
             raise BcrlError(f"{override.input_line}: {why}")
     try:
         return BasicSweeper.split_arguments(list(overrides), None)[0]

@@ -1,8 +1,4 @@
-"""The rule book: which learners, tasks and transfers make a course of stages.
-
-The command line and `bcrl.api` both make their stages here, so what one of them makes
-or rejects, the other does, too.
-"""
+"""The rule book of courses, from which the command line and `bcrl.api` make stages."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -147,7 +143,8 @@ def _check_dqn(chosen: Composition, learner: DQN, start: StageInit) -> None:
 
 
 def _check_slot(chosen: Composition, lspi: LSPI, slot: int, start: StageInit) -> None:
-    env = chosen.slots[slot]
+    check_lspi(lspi)
+    env, why = chosen.slots[slot], ""
     if getattr(env, "linear_quadratic", None) is None or not hasattr(env, "push"):
         why = "learns quadratic Q-functions of continuous actions, but "
         why += f"{env} is no linear-quadratic task"
@@ -156,11 +153,9 @@ def _check_slot(chosen: Composition, lspi: LSPI, slot: int, start: StageInit) ->
     elif slot:
         why = f"starts from nothing, so slot {slot + 1} would drop what the one before "
         why += "has learned: LSPI in the first slot, DQN in the others"
-    else:
-        check_lspi(lspi)
-        lspi.episodes_per_iteration(env)  # says whether they are whole
-        return
-    raise ConfigError("algorithm.learners", lspi.name, why)
+    if why:
+        raise ConfigError("algorithm.learners", lspi.name, why)
+    lspi.episodes_per_iteration(env)  # says whether they are whole
 
 
 def check_lspi(learner: LSPI) -> None:

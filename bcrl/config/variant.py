@@ -12,16 +12,8 @@ from bcrl.common.identity import Plain
 from bcrl.config.schema import Choice
 from bcrl.envs import Env
 from bcrl.errors import ConfigError
+from bcrl.learning import transfer as handed
 from bcrl.learning.curriculum import CURRICULA
-from bcrl.learning.transfer import (
-    TRANSFERS,
-    Boost,
-    ResidualPolicy,
-    StageInit,
-    Transfer,
-    tried,
-    warm_start,
-)
 from bcrl.q.functions import ZERO
 
 
@@ -31,17 +23,17 @@ class Composition:
 
     tasks: tuple[Env, ...]  # easiest first, the target last
     order: tuple[int, ...]  # the task of each slot
-    boost: Boost | None = None
-    transfer: Transfer | None = None
+    boost: handed.Boost | None = None
+    transfer: handed.Transfer | None = None
     scale: Plain = field(default_factory=dict)
 
     @property
-    def transfers(self) -> tuple[Transfer, ...]:
+    def transfers(self) -> tuple[handed.Transfer, ...]:
         """What happens between two stages: a warm start unless something else does."""
-        return self._chosen or (warm_start,)
+        return self._chosen or (handed.warm_start,)
 
     @property
-    def _chosen(self) -> tuple[Transfer, ...]:
+    def _chosen(self) -> tuple[handed.Transfer, ...]:
         return tuple(t for t in (self.boost, self.transfer) if t is not None)
 
     @property
@@ -55,9 +47,9 @@ class Composition:
         return all(env == self.tasks[-1] for env in self.slots)
 
     @cached_property
-    def start(self) -> StageInit | None:
+    def start(self) -> handed.StageInit | None:
         """What a later stage starts from, as far as transfers tell without training."""
-        return tried(self.transfers)
+        return handed.tried(self.transfers)
 
     def check(self) -> None:
         """Raise ConfigError for choices that make no sense together."""
@@ -67,7 +59,7 @@ class Composition:
             raise ConfigError(key, boost or transfer, _one_task(self.tasks[-1]))
         if start is None:
             return
-        why, residual = "", isinstance(start.behavior, ResidualPolicy)
+        why, residual = "", isinstance(start.behavior, handed.ResidualPolicy)
         if start.behavior and self.target_only:
             why = "needs an earlier task whose policy helps: curriculum=on"
         elif residual and getattr(self.tasks[-1], "actions", None) is None:
@@ -78,15 +70,15 @@ class Composition:
             raise ConfigError("transfer", transfer, why)
         for key, one in (("transfer", transfer), ("boosting", boost)):
             rest = tuple(other for other in self._chosen if other is not one)
-            if one is not None and tried(rest) == start:
+            if one is not None and handed.tried(rest) == start:
                 why = "has no effect: the next stage starts as it does without"
                 raise ConfigError(key, one, why)
 
 
 def composition(config: Plain, tasks: list[Env]) -> Composition:
     """The groups' choices; ConfigError if they make no sense together."""
-    boost = _component("boosting", config["boosting"], {"on": Boost})
-    transfer = _component("transfer", config["transfer"], TRANSFERS)
+    boost = _component("boosting", config["boosting"], {"on": handed.Boost})
+    transfer = _component("transfer", config["transfer"], handed.TRANSFERS)
     order = order_of(config["curriculum"]["name"], tasks)
     made = Composition(tuple(tasks), order, boost, transfer, config["scale"])
     made.check()  # before budgets, which are lists with one entry per task
