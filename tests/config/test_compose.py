@@ -57,10 +57,8 @@ def test_scales_choose_seeds_and_cap_budgets():
     assert len(plan("env=car_on_hill", "scale=paper").seeds) == 20
     smoke = [s.learner for s in plan(MAZE, "scale=smoke").stages]
     assert {(x.iterations, x.episodes) for x in smoke} == {(2, 20)}
-    # A tuning seed reports nothing.
-    tuned = {s for p in plans("experiment=search_nu") for s in p.seeds}
-    last = plan("env=linear_system", "scale=paper").seeds[-1]
-    assert tuned and not tuned & set(range(last + 1))
+    tuned = plans("experiment=search_nu")[0].seeds  # which report nothing
+    assert min(tuned) > plan("env=linear_system", "scale=paper").seeds[-1]
 
 
 def test_a_composition_of_ones_own_gets_a_directory_of_its_own():
@@ -148,8 +146,7 @@ def test_every_experiment_composes_at_every_scale():
             assert outcome(f"experiment={experiment}", f"scale={scale}") != "rejected"
 
 
-RELEASED_BOOST = Boost("residual", "two", False)
-RELEASED_SHAPE = Shape("before_reset", False)
+RELEASED = (Boost("residual", "two", False), Shape("before_reset", False))
 #: Of each variant: its name, transfers, learners and last target_update.
 VARIANTS = {
     "plain": ("DQN", (warm_start,), [DQN], 200),
@@ -160,11 +157,9 @@ VARIANTS = {
     "SBC": ("SBC-DQN", (Boost(), Shape()), [LSPI, DQN], 4000),
     "RPL": ("RPL", (ResidualPolicy(2000),), [LSPI, DQN], 25),
     "PPR": ("PPR", (PolicyReuse(0.998),), [LSPI, DQN], 200),
-    "BC_released": ("BC-DQN@released", (RELEASED_BOOST,), [LSPI, DQN], 2000),
-    "SC_released": ("SC-DQN@released", (RELEASED_SHAPE,), [LSPI, DQN], 4000),
-    "SBC_released": (
-        *("SBC-DQN@released", (RELEASED_BOOST, RELEASED_SHAPE), [LSPI, DQN], 4000),
-    ),
+    "BC_released": ("BC-DQN@released", RELEASED[:1], [LSPI, DQN], 2000),
+    "SC_released": ("SC-DQN@released", RELEASED[1:], [LSPI, DQN], 4000),
+    "SBC_released": ("SBC-DQN@released", RELEASED, [LSPI, DQN], 4000),
 }
 
 
