@@ -1,7 +1,6 @@
 """What each config key does: default, unit and allowed values, read from conf/.
 
-A key's comment is a sentence, then `Unit: ….` and `Allowed: ….` where they apply; it
-ends with a full stop. The comment at the top of a file describes the option.
+A key's comment is a sentence, then `Unit: ….` and `Allowed: ….` where they apply.
 """
 
 import re
@@ -59,10 +58,10 @@ def entries() -> list[Entry]:
     found = [e for group in ("", *GROUPS) for e in _of_group(group)]
     for path in sorted(CONF.glob("budget/*.yaml")):
         env, _, algorithm = path.stem.rpartition("_")
-        for key, value in yaml.safe_load(path.read_text("utf-8")).items():
-            for entry in found:
-                if entry.key == f"algorithm.{key}" and algorithm in entry.defaults:
-                    entry.defaults[f"env={env}"] = value
+        budget = yaml.safe_load(path.read_text("utf-8"))
+        for entry in (e for e in found if algorithm in e.defaults):
+            if (key := entry.key.removeprefix("algorithm.")) in budget:
+                entry.defaults[f"env={env}"] = budget[key]
     return found
 
 

@@ -22,9 +22,8 @@ from bcrl.config.hydra_compose import catalog, composed
 from bcrl.config.safety import check_override
 from bcrl.errors import BcrlError, closest
 
-HELP = Path(__file__).with_name("help.txt")
 #: Flags of which Hydra knows nothing, or that are handed to it in another way.
-_OURS = {"describe", "dry_run", "status", "runs_dir", "overrides", "config_dir"}
+_OURS = {"describe", "dry_run", "status", "runs_dir", "overrides", "config_dir", "help"}
 
 
 def arguments() -> Namespace:
@@ -60,7 +59,7 @@ def for_hydra(asked: Namespace) -> list[str]:
     given = []
     for action in flag_parser()._actions:
         value = getattr(asked, action.dest, None)
-        if value and action.dest not in {*_OURS, "help", "version"}:
+        if value and action.dest not in _OURS:
             short, long = (f(action.option_strings, key=len) for f in (min, max))
             given.append(short if value is True else f"{long}={value}")
     return given
@@ -102,7 +101,7 @@ def short() -> str:
 def manual(config_dir: str | None) -> str:
     """The help, with the options of every group, those of the user's folder too."""
     folders = (config_dir,) if config_dir else ()
-    text = Template(HELP.read_text("utf-8"))
+    text = Template(Path(__file__).with_name("help.txt").read_text("utf-8"))
     known = catalog(folders).items()
     options = {name.replace("/", "__"): ", ".join(each) for name, each in known}
     lines = text.substitute(options).splitlines()

@@ -21,12 +21,6 @@ from bcrl.config.overrides import parse
 from bcrl.config.schema import Config
 from bcrl.errors import BcrlError, closest
 
-#: Groups that Hydra would take any option of, known or not.
-OPTIONAL = ("budget", "tuned", "local")
-#: The groups whose options have keys.
-_SECTIONS = ("env", "algorithm", "algorithm/regressor", "boosting", "transfer")
-
-
 _READ = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text("utf-8"))
 #: Another tool's word → ours: a key, what to type for a whole word, or a key's value.
 _OURS = {
@@ -61,7 +55,7 @@ class Hints:
     @cached_property
     def brought(self) -> dict[str, str]:
         """The keys that options bring into their section, and the first such option."""
-        known = [e for e in reversed(entries()) if e.group in _SECTIONS]
+        known = [e for e in reversed(entries()) if e.group]
         return {e.key: f"{e.group}={next(iter(e.defaults))}" for e in known}
 
     @cached_property
@@ -148,7 +142,8 @@ class Hints:
             return "every run needs a choice of it, or its default" if needed else None
         if key in self.groups and not isinstance(value, str | Sweep | Glob):
             return f"name one option, or leave {key} out; {self.of_option(key, value)}"
-        if key in OPTIONAL and isinstance(value, str | Sweep):
+        optional = key in ("budget", "tuned", "local")  # any option passes in Hydra
+        if optional and isinstance(value, str | Sweep):
             for name in [value] if is_text else override.sweep_string_iterator():
                 if name not in self.groups.get(key, ()):
                     return f"there is no {name}; {self.of_option(key, name)}"

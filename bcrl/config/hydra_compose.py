@@ -99,10 +99,8 @@ def plain(section: DictConfig) -> Plain:
     """A section with its interpolations resolved, as dicts, lists and scalars."""
     try:
         return OmegaConf.to_container(section, resolve=True, throw_on_missing=True)  # type: ignore
-    except OmegaConfBaseException as error:
+    except (OmegaConfBaseException, RecursionError) as error:  # ${…} of itself
         raise BcrlError(first_lines(error)) from error
-    except RecursionError as error:
-        raise BcrlError("an interpolation, ${…}, refers to itself") from error
 
 
 def first_lines(error: BaseException) -> str:

@@ -119,12 +119,12 @@ def _plan(job: DictConfig, folders: Paths, typed: Sequence[str] | None) -> Plan:
         raise ConfigError("env.id", "???", "name an environment: env.id=CartPole-v1")
     name = choices.get("variant")
     for entry in read_option("variant", name, folders).get("defaults", ()):
-        for key, option in dict(entry).items():
-            group = key.removeprefix("override /")
-            if choices.get(group, option) != option:
-                why = f"means {group}={option}, but {group}={choices[group]} is chosen"
-                line = f"env={choices['env']} variant={name}"
-                raise ConfigError("variant", name, f"{why}; did you mean {line}?")
+        ((key, option),) = entry.items()
+        group = key.removeprefix("override /")
+        if (other := choices.get(group, option)) != option:
+            line = f"env={choices['env']} variant={name}"
+            why = f"means {group}={option}, not {group}={other}; did you mean {line}?"
+            raise ConfigError("variant", name, why)
     config = _plain(job)
     for key, name in plugins.named_code(config):
         said = (o.lstrip("+").partition("=") for o in typed or ())
@@ -202,9 +202,9 @@ def _only_chooses(hydra: DictConfig) -> bool:
     entries = experiment.get("defaults") or ()
     keys = [o.lstrip("+").partition("=")[0] for o in hydra.overrides.task]
     keys += [str(key).removeprefix("override /") for entry in entries for key in entry]
-    same = {"env.id", "variant", "experiment", *VARIANT_GROUPS}
-    only = experiment.keys() <= {"defaults", "hydra", *OUTPUT_KEYS}
-    return only and all(k in same or k.partition(".")[0] in OUTPUT_KEYS for k in keys)
+    same = {"env.id", "variant", "experiment", "defaults", "hydra", *VARIANT_GROUPS}
+    keys += experiment
+    return all(key in same or key.partition(".")[0] in OUTPUT_KEYS for key in keys)
 
 
 def _plain(job: DictConfig) -> Plain:

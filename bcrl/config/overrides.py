@@ -46,26 +46,12 @@ def parse(overrides: Sequence[str]) -> list[Override]:
 
 def canonical(overrides: Sequence[str], folders: Paths) -> list[str]:
     """The overrides as Hydra should read them; what is canonical stays as it is."""
-    found: dict[str, str] = {}  # of a key of seeds the last one holds
-    for each in _without_local(overrides):
-        for text in _canonical(each, folders):
-            key = text.partition("=")[0]
-            key = key if key.startswith("seeds.") else text
-            found.pop(key, None)
-            found[key] = text
-    return list(found.values())
-
-
-def _without_local(overrides: Sequence[str]) -> Sequence[str]:
-    """The overrides, with workers in place of the former launcher `local`."""
-    if "hydra/launcher=local" not in overrides:
-        return overrides
-    typed = [o.partition("n_jobs=")[2] for o in overrides if "launcher.n_jobs=" in o]
-    line = f"workers={next(filter(str.isdecimal, typed), os.cpu_count())}"
-    say(f"hydra/launcher=local: this launcher is gone; the command runs with {line}")
-    launcher = ("hydra/launcher=", "hydra.launcher.")
-    chosen = [o for o in overrides if not o.startswith(launcher)]
-    return chosen if any(o.startswith("workers=") for o in chosen) else [*chosen, line]
+    if "hydra/launcher=local" in overrides:  # a former launcher
+        say("hydra/launcher=local: this launcher is gone; workers=N takes its place")
+        renamed = [o.replace("hydra.launcher.n_jobs=", "workers=") for o in overrides]
+        kept = (o for o in renamed if not re.match("hydra[/.]launcher", o))
+        overrides = [f"workers={os.cpu_count()}", *kept]  # the last one holds
+    return [text for each in overrides for text in _canonical(each, folders)]
 
 
 def _canonical(text: str, folders: Paths) -> Iterator[str]:

@@ -96,7 +96,7 @@ def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
 
 def _asked(section: Plain) -> tuple[int, ...]:
     """All seeds: so many from the first on, or those that are listed."""
-    listed = section["only"] or ()
+    listed = section["only"] or []
     if section["count"] is not None:
         return tuple(range(section["first"], section["first"] + section["count"]))
     different = 0 < len(listed) == len(set(listed)) <= 10**6
@@ -115,8 +115,7 @@ def part(seeds: tuple[int, ...], which: str | None) -> tuple[int, ...]:
     if not 1 <= number <= parts <= len(seeds):
         why = f"must be K/N, the K-th of at most {len(seeds)} parts, such as 1/2"
         raise ConfigError("seeds.part", which, why)
-    first, after = ((k * len(seeds)) // parts for k in (number - 1, number))
-    return seeds[first:after]
+    return seeds[(number - 1) * len(seeds) // parts : number * len(seeds) // parts]
 
 
 def _variant(algorithm_name: str, chosen: Composition) -> str:
@@ -162,9 +161,8 @@ def _check_outputs(config: Plain, tag: str | None) -> None:
 
 def _tasks(section: Plain) -> tuple[list[Env], tuple[str, ...]]:
     """The environment's tasks, easiest first, and the metrics to record."""
-    tasks = tasks_of(section)
+    tasks, metrics = tasks_of(section), section.get("metrics")
     check_tasks(section["name"], tasks)
-    metrics = section.get("metrics")
     if not isinstance(metrics, list) or not metrics:
         raise ConfigError("env.metrics", metrics, "must be a list of metric names")
     check_metrics(metrics, tasks[-1])

@@ -39,10 +39,9 @@ PASSED_ON = {FQI: ("regressor",), DQN: ("hidden", "learning_rate")}
 def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...]:
     """The stages of a composition, given the learner of each slot.
 
-    One stage per slot. Plain DQN has one in all, with the steps of all slots and the
-    other settings of the last: its networks, task and replay stay the same. Raises
-    ConfigError for what can't be learned, or would have no effect. The composition's
-    scale caps the budgets in the end.
+    One stage per slot; plain DQN has one in all, with the steps of all slots and the
+    other settings of the last. The scale caps the budgets. Raises ConfigError for what
+    can't be learned, or would have no effect.
     """
     chosen.check()
     _check(chosen, learners)
@@ -129,15 +128,14 @@ def _check_dqn(chosen: Composition, learner: DQN, start: StageInit) -> None:
     size, widths, why = learner.replay_size, learner.hidden, ""
     key, value = "algorithm.replay_size", cast(Any, size)
     if size < learner.batch_size or size <= learner.learning_starts:
-        why = f"must hold a batch, batch_size={learner.batch_size}, and more than "
+        why = f"must be at least batch_size={learner.batch_size} and more than "
         why += f"learning_starts={learner.learning_starts}"
     elif not widths or not all(isinstance(w, Integral) and w >= 1 for w in widths):
         key, value = "algorithm.hidden", list(widths)
         why = "must be a list of layer widths, each at least 1"
     elif start.initial is not ZERO and chosen.transfers != (warm_start,):
         key, value = "transfer", chosen.transfer
-        why = "sets `initial`, but DQN starts from networks: set `base`, `potential` "
-        why += "or `prior`"
+        why = "sets `initial`, but DQN needs networks there: set `base` or `prior`"
     if why:
         raise ConfigError(key, value, why)
 
@@ -146,13 +144,11 @@ def _check_slot(chosen: Composition, lspi: LSPI, slot: int, start: StageInit) ->
     check_lspi(lspi)
     env, why = chosen.slots[slot], ""
     if getattr(env, "linear_quadratic", None) is None or not hasattr(env, "push"):
-        why = "learns quadratic Q-functions of continuous actions, but "
-        why += f"{env} is no linear-quadratic task"
+        why = f"learns quadratic Q-functions, but {env} is no linear-quadratic task"
     elif start.initial is not ZERO:
         why = "leaves no network to start DQN's from: boosting=on or a transfer needed"
     elif slot:
-        why = f"starts from nothing, so slot {slot + 1} would drop what the one before "
-        why += "has learned: LSPI in the first slot, DQN in the others"
+        why = "starts from nothing: LSPI in the first slot only, DQN in the others"
     if why:
         raise ConfigError("algorithm.learners", lspi.name, why)
     lspi.episodes_per_iteration(env)  # says whether they are whole

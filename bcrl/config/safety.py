@@ -81,19 +81,16 @@ def check_override(text: str) -> None:
         text.encode()
     except UnicodeEncodeError as error:
         raise BcrlError(f"{short} isn't valid UTF-8") from error
-    if len(text) > OVERRIDE:
-        raise BcrlError(f"{short} is longer than {OVERRIDE} characters; use a YAML")
-    opening = sum(text.count(bracket) for bracket in "[({")
-    if max(opening, text.partition("=")[0].count(".")) > DEPTH:
-        raise BcrlError(f"{short} has more than {DEPTH} brackets or nested keys")
+    levels = max(len(re.findall(r"[\[({]", text)), text.partition("=")[0].count("."))
+    if len(text) > OVERRIDE or levels > DEPTH:
+        most = f"{OVERRIDE} characters, {DEPTH} brackets or {DEPTH} nested keys"
+        raise BcrlError(f"{short} is longer than {most}")
 
 
 def check_file(path: Path) -> None:
     """Raise BcrlError for a file that isn't plain, small YAML in UTF-8."""
-    if not path.is_file():  # a pipe would never end
-        raise BcrlError(f"{path} is no regular file")
-    if path.stat().st_size > FILE_BYTES:
-        raise BcrlError(f"{path} is larger than {FILE_BYTES // 1024} KiB")
+    if not path.is_file() or path.stat().st_size > FILE_BYTES:  # a pipe never ends
+        raise BcrlError(f"{path} is no file of at most {FILE_BYTES // 1024} KiB")
     try:
         check_yaml(path.read_text("utf-8"))
     except (UnicodeDecodeError, yaml.YAMLError) as error:

@@ -105,7 +105,6 @@ def check_written(package: str, config: DictConfig) -> None:
             raise ConfigError(f"{place}{key}", value, "quote it where it is a name")
 
 
-NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{,99}")
 COMPONENT, PARTS = 200, 50  # bytes of a part of a path, and how many parts
 BASIC = {"_target_": "hydra._internal.core_plugins.basic_launcher.BasicLauncher"}
 
@@ -146,7 +145,7 @@ def check_launcher(values: Plain | None) -> None:
 
 def check_name(key: str, text: str) -> None:
     """Raise ConfigError for what isn't a plain name of a file or folder."""
-    if not NAME.fullmatch(text):
+    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{,99}", text):
         why = "must be a plain name of at most 100 letters, digits, '.', '_' and '-'"
         raise ConfigError(key, text[:40], why)
 

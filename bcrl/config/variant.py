@@ -86,10 +86,9 @@ def composition(config: Plain, tasks: list[Env]) -> Composition:
 
 
 def order_of(curriculum: object, tasks: Sequence[Env]) -> tuple[int, ...]:
-    """The task of each slot: as many slots as tasks, the target among them.
+    """The task of each of n slots; ConfigError for an order without the target.
 
-    `curriculum` is one of CURRICULA, a trusted `module.function` or a function from the
-    number of tasks to their order. Raises ConfigError for an order that is none.
+    `curriculum` is one of CURRICULA, a trusted `module.function` or a function of n.
     """
     n = len(tasks)
     if n == 1 and curriculum != "off":
@@ -117,8 +116,7 @@ def order_of(curriculum: object, tasks: Sequence[Env]) -> tuple[int, ...]:
 
 
 def _one_task(env: Env) -> str:
-    why = f"{env.name} has one task, so there is no stage to hand over"
-    return f"{why}; env.tasks needs at least two values"
+    return f"{env.name} has one task; env.tasks needs at least two values"
 
 
 def _component(group: str, section: Plain, classes: Mapping[str, type]) -> Any:

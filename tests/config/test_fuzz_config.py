@@ -140,13 +140,7 @@ def driven(bad, base):
     drive(*base, "--", *bad) if bad[0][:1] == "-" else drive(*base, *bad)
 
 
-BASES = [
-    ["env=maze"],
-    ["env=maze"],
-    ["-m", "env=maze"],
-    ["env=maze", "--info", "all"],
-    [],
-]
+BASES = [["env=maze"], ["-m", "env=maze"], ["env=maze", "--info", "all"], []]
 SOME = given(st.lists(overrides(), min_size=1, max_size=3), st.sampled_from(BASES))
 test_some_bad_overrides_end_in_a_message = fuzz(0.1, most=12)(SOME(driven))
 test_bad_overrides_end_in_a_message = pytest.mark.slow(fuzz(0.55)(SOME(driven)))
