@@ -39,8 +39,7 @@ class Hints:
     @cached_property
     def groups(self) -> dict[str, list[str]]:
         """The options of each group."""
-        hydra = {"hydra/launcher": ["slurm"], "hydra/sweeper": ["basic"]}
-        return compose.catalog(self.folders) | hydra
+        return compose.catalog(self.folders) | {"hydra/sweeper": ["basic"]}
 
     @cached_property
     def present(self) -> Plain:

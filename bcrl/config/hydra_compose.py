@@ -32,6 +32,7 @@ UNKNOWN = re.compile(
     r"|Could not delete from config\. '([^']+)' does not exist"
     r"|Multiple values for ([^.\s]+)\."
     r"|In '[^']*': ConfigKeyError .* Key '([^']+)' not in 'Config'"
+    r"|You must specify 'env'"
 )
 Paths = tuple[str, ...]  # of folders of configs, besides our own
 
@@ -88,10 +89,7 @@ def composed(
     except Exception as error:  # e.g. YAML's own; composing runs nothing of ours
         raise BcrlError(f"the configs can't be read: {first_lines(error)}") from error
     if unknown := UNKNOWN.match(message):
-        key = next(filter(None, unknown.groups()))
-        raise Unknown(message if message[:3] == "In " else f"{key}: unknown key", key)
-    if message.startswith("You must specify 'env'"):
-        raise Unknown(message, "")
+        raise Unknown(message, next(filter(None, unknown.groups()), ""))
     raise BcrlError(message)
 
 

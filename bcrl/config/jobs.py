@@ -100,10 +100,9 @@ def _params(hydra: DictConfig, folders: Paths) -> list[Override]:
     swept = hydra.sweeper.get("params") or {}
     for key in map(str, swept):
         if key.lstrip("+~").startswith("hydra"):
-            why = "a config can't sweep over Hydra's own keys"
-            raise ConfigError(f"hydra.sweeper.params.{key}", swept[key], why)
-    params = [f"{key}={value}" for key, value in swept.items()]
-    return parse(canonical(params, folders))
+            name = f"hydra.sweeper.params.{key}"
+            raise ConfigError(name, swept[key], "can't sweep over Hydra's own keys")
+    return parse(canonical([f"{key}={swept[key]}" for key in swept], folders))
 
 
 def _plan(job: DictConfig, folders: Paths, typed: Sequence[str] | None) -> Plan:
@@ -112,9 +111,6 @@ def _plan(job: DictConfig, folders: Paths, typed: Sequence[str] | None) -> Plan:
     launcher = hydra.launcher and hydra_compose.plain(hydra.launcher)
     schema.check_launcher(launcher)
     launched = launcher["_target_"] != schema.BASIC["_target_"]
-    for group in VARIANT_GROUPS:
-        if choices.get(group) is None:
-            raise BcrlError(f"{group}: every run needs a choice of it")
     if choices["env"] == OPEN and OmegaConf.is_missing(job.env, "id"):
         raise ConfigError("env.id", "???", "name an environment: env.id=CartPole-v1")
     name = choices.get("variant")

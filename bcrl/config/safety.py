@@ -58,8 +58,7 @@ class ConfigFolder(FileConfigSource):
         if isinstance(loaded.config, DictConfig):
             schema.check_written(package, loaded.config)
             if OmegaConf.select(loaded.config, "hydra.searchpath") is not None:
-                why = "only the command line names folders of configs: --config-dir"
-                raise BcrlError(f"hydra.searchpath in {config_path}: {why}")
+                raise BcrlError(f"hydra.searchpath in {config_path}: use --config-dir")
         return loaded
 
 

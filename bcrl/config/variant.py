@@ -16,6 +16,8 @@ from bcrl.learning import transfer as handed
 from bcrl.learning.curriculum import CURRICULA
 from bcrl.q.functions import ZERO
 
+ONE_TASK = "there is one task; env.tasks needs at least two values"
+
 
 @dataclass(frozen=True)
 class Composition:
@@ -56,7 +58,7 @@ class Composition:
         boost, transfer, start = self.boost, self.transfer, self.start
         if len(self.order) == 1 and self._chosen:
             key = "boosting" if boost else "transfer"
-            raise ConfigError(key, boost or transfer, _one_task(self.tasks[-1]))
+            raise ConfigError(key, boost or transfer, ONE_TASK)
         if start is None:
             return
         why, residual = "", isinstance(start.behavior, handed.ResidualPolicy)
@@ -92,7 +94,7 @@ def order_of(curriculum: object, tasks: Sequence[Env]) -> tuple[int, ...]:
     """
     n = len(tasks)
     if n == 1 and curriculum != "off":
-        raise ConfigError("curriculum", curriculum, _one_task(tasks[-1]))
+        raise ConfigError("curriculum", curriculum, ONE_TASK)
     ordered: Any = curriculum
     if isinstance(curriculum, str) and "." in curriculum:
         ordered = plugins.attribute("curriculum.name", curriculum, curriculum)
@@ -113,10 +115,6 @@ def order_of(curriculum: object, tasks: Sequence[Env]) -> tuple[int, ...]:
         why += f"integers from 0 to {n - 1}, with the target, {n - 1}, among them"
         raise ConfigError("curriculum", curriculum, why)
     return order
-
-
-def _one_task(env: Env) -> str:
-    return f"{env.name} has one task; env.tasks needs at least two values"
 
 
 def _component(group: str, section: Plain, classes: Mapping[str, type]) -> Any:

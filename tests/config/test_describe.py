@@ -44,18 +44,10 @@ def test_comments_have_all_their_parts():
         assert allowed or entry.key.rpartition(".")[2] in FREE_TEXT.split(), entry
 
 
-@pytest.mark.parametrize(
-    ("key", "default", "unit", "allowed"),
-    [
-        ("env.tasks.mass", "[0.8, 1.0, 1.2]", "kg", "> 0"),
-        ("algorithm.batch_size", "32", "transitions", "≥ 1"),
-        ("checkpoint_every", "60", "seconds", "> 0"),
-    ],
-)
-def test_a_description_has_default_unit_and_allowed_values(key, default, unit, allowed):
-    lines = [line.strip() for line in describe.describe(key).splitlines()]
-    for line in (key, f"Default: {default}.", f"Unit: {unit}.", f"Allowed: {allowed}."):
-        assert line in lines
+def test_a_description_has_default_unit_and_allowed_values():
+    lines = [line.strip() for line in describe.describe("env.tasks.mass").splitlines()]
+    said = ["Default: [0.8, 1.0, 1.2].", "Unit: kg.", "Allowed: > 0."]
+    assert lines[0] == "env.tasks.mass" and lines[-3:] == said
 
 
 def test_defaults_differ_between_options_and_environments():

@@ -27,7 +27,6 @@ from bcrl.learning.transfer import (
 )
 from bcrl.q.functions import ZERO, Sum
 from bcrl.q.regressors.ours import REGRESSORS
-from tests.conftest import plans
 from tests.toys import OpenCorridor
 
 
@@ -224,17 +223,6 @@ def test_numbers_of_numpy_are_numbers_and_the_order_of_transfers_is_free():
     assert len(api.stages(TASKS, given)) == 3
     one, other = (api.stages(TASKS, FITTED, *t) for t in ((SHAPE, B), (B, SHAPE)))
     assert one == other and one[0].transfers == (B, SHAPE)
-
-
-def test_one_of_several_lspi_stages_would_forget_the_others():
-    """Written out in a config it is rejected; left to `auto` only the first is LSPI."""
-    lq = ("env=linear_system", "algorithm=dqn", "boosting=on")
-    lq += ("env.tasks.task=[lq,lq]", "env.tasks.horizon=[100,120]")
-    lq += ("algorithm.steps=[2000,2400]", "algorithm.evaluation_episodes=5")
-    with pytest.raises(ConfigError, match=r"algorithm\.learners=lspi.*first slot"):
-        plans(*lq, "algorithm.learners=[lspi,lspi]", "curriculum=on")
-    (made,) = plans(*lq, "curriculum=on")
-    assert [stage.learner.name for stage in made.stages] == ["lspi", "dqn"]
 
 
 # --- a user's transfers ---
