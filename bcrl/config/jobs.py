@@ -100,8 +100,8 @@ def _params(hydra: DictConfig, folders: Paths) -> list[Override]:
     swept = hydra.sweeper.get("params") or {}
     for key in map(str, swept):
         if key.lstrip("+~").startswith("hydra"):
-            name = f"hydra.sweeper.params.{key}"
-            raise ConfigError(name, swept[key], "can't sweep over Hydra's own keys")
+            why = "Hydra's own keys can't be swept over"
+            raise ConfigError(f"hydra.sweeper.params.{key}", swept[key], why)
     return parse(canonical([f"{key}={swept[key]}" for key in swept], folders))
 
 

@@ -1,7 +1,4 @@
-"""The overrides of a command line: parsed, and written as they are meant.
-
-Hydra guesses types: `tag=1e3` would be 1000.0. Here a name stays what was typed.
-"""
+"""The overrides of a command line, as they are meant: `tag=1e3` is no number."""
 
 import math
 import os

@@ -101,8 +101,7 @@ def _asked(section: Plain) -> tuple[int, ...]:
         return tuple(range(section["first"], section["first"] + section["count"]))
     different = 0 < len(listed) == len(set(listed)) <= 10**6
     if not different or min(listed) < 0 or max(listed) > 2**32:
-        why = "must be different seeds, from 0 to 2^32: seeds=[3,7]"
-        raise ConfigError("seeds.only", listed, why)
+        raise ConfigError("seeds.only", listed, "must differ, 0 to 2^32: seeds=[3,7]")
     return tuple(sorted(listed))
 
 

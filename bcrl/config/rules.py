@@ -128,8 +128,7 @@ def _check_dqn(chosen: Composition, learner: DQN, start: StageInit) -> None:
     size, widths, why = learner.replay_size, learner.hidden, ""
     key, value = "algorithm.replay_size", cast(Any, size)
     if size < learner.batch_size or size <= learner.learning_starts:
-        why = f"must be at least batch_size={learner.batch_size} and more than "
-        why += f"learning_starts={learner.learning_starts}"
+        why = f"must hold a batch and exceed learning_starts={learner.learning_starts}"
     elif not widths or not all(isinstance(w, Integral) and w >= 1 for w in widths):
         key, value = "algorithm.hidden", list(widths)
         why = "must be a list of layer widths, each at least 1"

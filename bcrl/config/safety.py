@@ -69,17 +69,14 @@ class OwnSearchPath(SearchPathPlugin):
         """Change the place of the main configs."""
         for place in search_path.get_path():
             if place.provider == "main":
-                path = (place.path or "").removeprefix("file://")
-                place.path = f"{ConfigFolder.scheme()}://{path}"
+                place.path = "bcrl://" + (place.path or "").removeprefix("file://")
 
 
 def check_override(text: str) -> None:
     """Raise BcrlError for an override that a parser would choke on."""
     short = repr(text[:60])
-    try:
-        text.encode()
-    except UnicodeEncodeError as error:
-        raise BcrlError(f"{short} isn't valid UTF-8") from error
+    if re.search("[\ud800-\udfff]", text):
+        raise BcrlError(f"{short} isn't valid UTF-8")
     levels = max(len(re.findall(r"[\[({]", text)), text.partition("=")[0].count("."))
     if len(text) > OVERRIDE or levels > DEPTH:
         most = f"{OVERRIDE} characters, {DEPTH} brackets or {DEPTH} nested keys"
@@ -92,11 +89,9 @@ def check_file(path: Path) -> None:
         raise BcrlError(f"{path} is no file of at most {FILE_BYTES // 1024} KiB")
     try:
         check_yaml(path.read_text("utf-8"))
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
+    except (UnicodeDecodeError, yaml.YAMLError, BcrlError) as error:
         words = " ".join(str(error).split())
         raise BcrlError(f"{path} can't be read: {words}") from error
-    except BcrlError as error:
-        raise BcrlError(f"{path} {error}") from error
 
 
 def check_yaml(text: str) -> None:
@@ -110,16 +105,16 @@ def check_yaml(text: str) -> None:
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if nodes > NODES or depth > DEPTH or aliases > REPEATS:
             most = f"{NODES} values, {DEPTH} levels and {REPEATS} aliases"
-            raise BcrlError(f"is too large: at most {most} are read")
+            raise BcrlError(f"it is too large: at most {most} are read")
         if not TAGS.fullmatch(str(getattr(event, "tag", None))):
-            raise BcrlError(f"has the tag {event.tag!r}; only plain values can be read")
+            raise BcrlError(f"it has the tag {event.tag!r}; only plain values are read")
         if isinstance(event, yaml.ScalarEvent) and event.implicit[0]:
             word = event.value
             kind = resolver.resolve(yaml.ScalarNode, word, (True, False))[-5:]
             odd = kind == ":bool" and word.lower() not in ("true", "false")
             digits = kind in ("2:int", "float")
             if odd or (digits and re.search("[:_xb]|^[+-]?0[0-9]", word)):
-                why = f"has a bare {word}, which YAML reads as {yaml.safe_load(word)}"
+                why = f"it has a bare {word}, read as {yaml.safe_load(word)} by YAML"
                 raise BcrlError(f"{why}; write what is meant, or quote it as a name")
 
 

@@ -87,10 +87,7 @@ def section_of_seeds(key: str, value: object) -> dict[str, Any]:
 
 
 def check_written(package: str, config: DictConfig) -> None:
-    """Check what a file says of seeds and texts; `seeds: 5` becomes the section's keys.
-
-    Raises ConfigError for seeds named twice, and for a number as text: `tag: 1e3`.
-    """
+    """Check a file's seeds and texts; `seeds: 5` becomes the keys of its section."""
     place = "" if package in ("", "_global_") else package.replace("/", ".") + "."
     values: Any = OmegaConf.to_container(config, resolve=False)
     named = [] if place else [k for k in ("seed", "seeds") if values.get(k) is not None]
@@ -105,7 +102,6 @@ def check_written(package: str, config: DictConfig) -> None:
             raise ConfigError(f"{place}{key}", value, "quote it where it is a name")
 
 
-COMPONENT, PARTS = 200, 50  # bytes of a part of a path, and how many parts
 BASIC = {"_target_": "hydra._internal.core_plugins.basic_launcher.BasicLauncher"}
 
 
@@ -139,8 +135,7 @@ def check_launcher(values: Plain | None) -> None:
             check_path(name, value)
     delay, limit = values.get("signal_delay_s", 0), values.get("timeout_min", math.inf)
     if delay >= 60 * limit:
-        why = f"leaves nothing of timeout_min={limit} minutes"
-        raise ConfigError("hydra.launcher.signal_delay_s", delay, why)
+        raise ConfigError("hydra.launcher.signal_delay_s", delay, "exceeds timeout_min")
 
 
 def check_name(key: str, text: str) -> None:
@@ -153,13 +148,13 @@ def check_name(key: str, text: str) -> None:
 def check_path(key: str, text: str) -> None:
     """Raise ConfigError for a path that leads out of this folder, or can't be made."""
     path = PurePath(text)
-    longest = max((len(part.encode()) for part in path.parts), default=0)
+    longest = max((len(part.encode()) for part in path.parts), default=0)  # bytes
     for wrong, why in (
         (not text.strip(), "must name a folder"),
         (text.startswith("~"), "~ isn't expanded; write $HOME or the whole path"),
         (".." in path.parts and not path.is_absolute(), "leads out of this folder"),
         (not text.isprintable() or "://" in text, "isn't the name of a folder"),
-        (longest > COMPONENT or len(path.parts) > PARTS, "is too long for a path"),
+        (longest > 200 or len(path.parts) > 50, "is too long for a path"),
     ):
         if wrong:
             raise ConfigError(key, repr(text[:40]) if "~" not in text else text, why)

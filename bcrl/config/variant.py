@@ -73,8 +73,7 @@ class Composition:
         for key, one in (("transfer", transfer), ("boosting", boost)):
             rest = tuple(other for other in self._chosen if other is not one)
             if one is not None and handed.tried(rest) == start:
-                why = "has no effect: the next stage starts as it does without"
-                raise ConfigError(key, one, why)
+                raise ConfigError(key, one, "has no effect: stages start as without it")
 
 
 def composition(config: Plain, tasks: list[Env]) -> Composition:
