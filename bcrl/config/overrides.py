@@ -46,9 +46,15 @@ def canonical(overrides: Sequence[str], folders: Paths) -> list[str]:
     if "hydra/launcher=local" in overrides:  # a former launcher
         say("hydra/launcher=local: this launcher is gone; workers=N takes its place")
         renamed = [o.replace("hydra.launcher.n_jobs=", "workers=") for o in overrides]
-        kept = (o for o in renamed if not re.match("hydra[/.]launcher", o))
-        overrides = [f"workers={os.cpu_count()}", *kept]  # the last one holds
-    return [text for each in overrides for text in _canonical(each, folders)]
+        overrides = [o for o in renamed if not re.match("hydra[/.]launcher", o)]
+        if not any(o.startswith("workers=") for o in overrides):
+            overrides += [f"workers={os.cpu_count()}"]
+    found: dict[str, str] = {}  # of a key of seeds the last one holds
+    for text in (text for each in overrides for text in _canonical(each, folders)):
+        key = text.partition("=")[0] if text.startswith("seeds.") else text
+        found.pop(key, None)
+        found[key] = text
+    return list(found.values())
 
 
 def _canonical(text: str, folders: Paths) -> Iterator[str]:

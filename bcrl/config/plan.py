@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from bcrl.common import compiling, plugins
-from bcrl.common.checks import one_of
+from bcrl.common.checks import construct, one_of
 from bcrl.common.identity import Plain
 from bcrl.config.algorithms import algorithm
 from bcrl.config.rules import check_numbers
-from bcrl.config.schema import check_name, check_path
+from bcrl.config.schema import Choice, Config, check_name, check_path
 from bcrl.config.variant import Composition, composition
 from bcrl.envs import Env, check_tasks, tasks_of
-from bcrl.errors import ConfigError
+from bcrl.errors import ConfigError, did_you_mean
 from bcrl.evaluation.metrics import check_metrics
 from bcrl.learning.stage import Stage
 from bcrl.learning.transfer import PolicyReuse, ResidualPolicy, Shape
@@ -147,6 +147,10 @@ def usable_device(wanted: str, family: str) -> str:
 
 def _check_outputs(config: Plain, tag: str | None) -> None:
     """Raise ConfigError for what the keys outside of the groups can't be."""
+    known = Config.__annotations__
+    for key in config.keys() - known:
+        raise ConfigError(key, config[key], f"unknown key; {did_you_mean(key, known)}")
+    construct("curriculum", Choice, config["curriculum"])
     for section in ("seeds", "scale", ""):
         values = config[section] if section else config
         check_numbers(section, {k: v for k, v in values.items() if v is not None})
