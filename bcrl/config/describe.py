@@ -1,7 +1,4 @@
-"""What each config key does: default, unit and allowed values, read from conf/.
-
-A key's comment is a sentence, then `Unit: ….` and `Allowed: ….` where they apply.
-"""
+"""What each config key does, by its comment in conf/: `Text. Unit: …. Allowed: ….`"""
 
 import re
 import textwrap

@@ -30,10 +30,7 @@ OPEN = "gymnasium"
 
 
 def plans(arguments: Namespace) -> list[Plan]:
-    """The checked plan of each job that this command line asks for.
-
-    The arguments' overrides are canonical afterwards, their folders absolute.
-    """
+    """The jobs' checked plans; the overrides are canonical afterwards."""
     overrides, multirun = list(arguments.overrides), arguments.multirun
     folders = _folders(arguments)
     Hints(tuple(arguments.overrides), folders).check()
@@ -157,11 +154,7 @@ def _command(hydra: DictConfig, folders: Paths, launched: bool) -> str:
 
 
 def _tag(config: Plain, hydra: DictConfig, folders: Paths) -> str | None:
-    """What names a run besides its variant: its tag, `released`, or a digest.
-
-    The config is compared with the shipped options that have its components' names, in
-    the paper's reading, which needs no tag, and in that of the authors' code.
-    """
+    """The tag: the given one, none for the paper's options, `released`, or a digest."""
     if config["tag"] is not None:
         return config["tag"]
     choices = hydra.runtime.choices

@@ -48,7 +48,7 @@ def canonical(overrides: Sequence[str], folders: Paths) -> list[str]:
         renamed = [o.replace("hydra.launcher.n_jobs=", "workers=") for o in overrides]
         overrides = [o for o in renamed if not re.match("hydra[/.]launcher", o)]
         if not any(o.startswith("workers=") for o in overrides):
-            overrides += [f"workers={os.cpu_count()}"]
+            overrides.append(f"workers={os.cpu_count()}")
     found: dict[str, str] = {}  # of a key of seeds the last one holds
     for text in (text for each in overrides for text in _canonical(each, folders)):
         key = text.partition("=")[0] if text.startswith("seeds.") else text

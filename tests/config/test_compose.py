@@ -46,8 +46,6 @@ def test_the_papers_budgets():
     assert [s.learner.iterations for s in hill.stages] == [20] * 3
     assert [s.learner.new_data for s in hill.stages] == [True, False, False]
     assert [s.env.mass for s in hill.stages] == [1.2] * 3
-    both = plan("env=car_on_hill", "curriculum=on", "boosting=on")
-    assert all(s.learner.new_data for s in both.stages)
 
 
 def test_scales_choose_seeds_and_cap_budgets():
