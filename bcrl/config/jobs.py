@@ -86,7 +86,8 @@ def _folders(arguments: Namespace) -> Paths:
     folders = [Path(folder).absolute() for folder in found]
     for folder in folders:
         if not folder.is_dir():
-            close = guess(folder.name, [path.name for path in folder.parent.glob("*/")])
+            near = [path.name for path in folder.parent.glob("*/")]
+            close = guess(folder.name, near) or "check its name"
             raise BcrlError(f"--config-dir: there is no folder {folder}; {close}")
     arguments.folders = tuple(map(str, folders))
     return arguments.folders
