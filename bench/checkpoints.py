@@ -12,7 +12,7 @@ import tempfile
 import time
 from argparse import Namespace
 
-from bcrl.config import jobs, schema
+from bcrl.config import jobs
 from bcrl.results.layout import seed_path
 from bcrl.run import checkpoints, runner
 
@@ -42,7 +42,6 @@ class Timed:
 
 
 def main(every: str = "60") -> None:
-    schema.register_schema()
     print(f"{'':14}{'run, s':>8}{'written':>9}{'MiB':>8}{'ms each':>9}{'share':>8}")
     for name, choice in CHOICES.items():
         with tempfile.TemporaryDirectory() as folder:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from bcrl.config import jobs, schema
+from bcrl.config import jobs
 from bcrl.config.plan import Plan
 from bcrl.evaluation.step_metrics import evaluate
 from bcrl.learning.dqn import DQNTrainer
@@ -81,7 +81,6 @@ def multiplying() -> float:
 
 
 def main() -> None:
-    schema.register_schema()
     torch.set_num_threads(1)
     print(
         f"this core multiplies (32, 128) by (128, 128) at {multiplying():.0f} GFLOP/s"

@@ -1,8 +1,4 @@
-"""What each config key does: default, unit and allowed values, read from conf/.
-
-A key's comment is a sentence, then `Unit: ….` and `Allowed: ….` where they apply; it
-ends with a full stop. The comment at the top of a file describes the option.
-"""
+"""What each config key does, by its comment in conf/: `Text. Unit: …. Allowed: ….`"""
 
 import re
 import textwrap
@@ -13,7 +9,7 @@ import yaml
 
 from bcrl.common.identity import flat
 from bcrl.config.hydra_compose import CONF
-from bcrl.errors import BcrlError
+from bcrl.errors import BcrlError, guess
 
 #: The groups whose options bring keys.
 GROUPS = (
@@ -59,10 +55,10 @@ def entries() -> list[Entry]:
     found = [e for group in ("", *GROUPS) for e in _of_group(group)]
     for path in sorted(CONF.glob("budget/*.yaml")):
         env, _, algorithm = path.stem.rpartition("_")
-        for key, value in yaml.safe_load(path.read_text("utf-8")).items():
-            for entry in found:
-                if entry.key == f"algorithm.{key}" and algorithm in entry.defaults:
-                    entry.defaults[f"env={env}"] = value
+        budget = yaml.safe_load(path.read_text("utf-8"))
+        for entry in (e for e in found if algorithm in e.defaults):
+            if (key := entry.key.removeprefix("algorithm.")) in budget:
+                entry.defaults[f"env={env}"] = budget[key]
     return found
 
 
@@ -79,8 +75,16 @@ def option_comments(group: str) -> dict[str, str]:
 def describe(word: str) -> str:
     """What a key does, or what a group or section has; "": a list of all keys."""
     key, known = word.partition("=")[0], entries()
-    if chosen := [entry for entry in known if entry.key == key]:
-        return "\n".join([key, *(_block(entry, len(chosen) > 1) for entry in chosen)])
+    lines, chosen = [key], [entry for entry in known if entry.key == key]
+    for entry in chosen:
+        text, unit, allowed = entry.parts
+        facts = [f"With {entry.group}={', '.join(entry.defaults)}:"] * (len(chosen) > 1)
+        facts += [text, f"Default: {entry.default}."]
+        facts += [f"Unit: {unit}."] * bool(unit)
+        facts += [f"Allowed: {allowed}."] * bool(allowed)
+        lines += (textwrap.fill(f"  {x}", 88, subsequent_indent="    ") for x in facts)
+    if chosen:
+        return "\n".join(lines)
     prefix = f"{key.replace('/', '.')}." if key else ""
     listed = option_comments(key) if key in (*GROUPS, *SHORTHANDS) else {}
     listed = {f"{key}={option}": text for option, text in listed.items()}
@@ -88,20 +92,8 @@ def describe(word: str) -> str:
         listed.setdefault(entry.key, entry.parts[0].partition(". ")[0])
     if listed:
         return "\n".join(f"{name}: {text.rstrip('.')}" for name, text in listed.items())
-    from bcrl.config.hints import Hints  # composes a config, which takes a while
-
-    near = Hints(()).key(key)
-    hint = f"did you mean {near}?" if near else "bcrl --describe lists all keys"
-    raise BcrlError(f"--describe {key}: unknown key; {hint}")
-
-
-def _block(entry: Entry, several: bool) -> str:
-    text, unit, allowed = entry.parts
-    facts = [f"With {entry.group}={', '.join(entry.defaults)}:"] * several
-    facts += [text, f"Default: {entry.default}."]
-    facts += [f"Unit: {unit}."] * bool(unit) + [f"Allowed: {allowed}."] * bool(allowed)
-    wrapped = (textwrap.fill(f"  {x}", 88, subsequent_indent="    ") for x in facts)
-    return "\n".join(wrapped)
+    meant = guess(key, (e.key for e in known)) or "bcrl --describe lists all keys"
+    raise BcrlError(f"--describe {key}: unknown key; {meant}")
 
 
 def _of_group(group: str) -> list[Entry]:
@@ -126,19 +118,15 @@ def _of_group(group: str) -> list[Entry]:
 
 
 def _comments(text: str) -> dict[str, str]:
-    """Dotted key → its comment: beside it and on the lines below, or else above it."""
+    """Dotted key → its comment: beside it and on the lines below."""
     found: dict[str, str] = {}
     stack: list[tuple[int, str]] = []
-    name, above = "", ""
     for line in text.splitlines():
         comment = COMMENT.search(line)
         if key := KEY.match(line):
             stack = [x for x in stack if x[0] < len(key[1])] + [(len(key[1]), key[2])]
             name = ".".join(part for _, part in stack)
-            found[name], above = comment[1] if comment else above, ""
-        elif comment and re.match(r"\s+#", line):
-            if found.get(name):
-                found[name] += f" {comment[1]}"
-            else:
-                above = f"{above} {comment[1]}".strip()
+            found[name] = comment[1] if comment else ""
+        elif found and comment and re.match(r"\s+#", line):
+            found[name] = f"{found[name]} {comment[1]}".strip()
     return {name: text for name, text in found.items() if text.endswith(".")}

@@ -18,19 +18,18 @@ from omegaconf import OmegaConf
 from bcrl import __version__
 from bcrl.common.files import user_folder
 from bcrl.common.identity import flat
-from bcrl.config.hydra_compose import composed, group_names, options
+from bcrl.config.hydra_compose import catalog, composed
 from bcrl.config.safety import check_override
 from bcrl.errors import BcrlError, closest
 
-HELP = Path(__file__).with_name("help.txt")
 #: Flags of which Hydra knows nothing, or that are handed to it in another way.
-_OURS = {"describe", "dry_run", "status", "runs_dir", "overrides", "config_dir"}
+_OURS = {"describe", "dry_run", "status", "runs_dir", "overrides", "config_dir", "help"}
 
 
 def arguments() -> Namespace:
     """What the command line asks for; `unnamed`: it names no folder of configs."""
     flags, words = flag_parser(), sys.argv[1:]
-    names = _names(flags)
+    names = list(flags._option_string_actions)
     for word in words:
         check_override(word)
     for place, word in enumerate(takewhile(lambda word: word != "--", words)):
@@ -40,13 +39,12 @@ def arguments() -> Namespace:
         if name[:1] == "-" and not (name in names or letters or is_long):
             from bcrl.config.hints import Hints  # a large import
 
-            chosen = tuple(each for each in words if re.match(r"[^-].*=", each))
+            hints = Hints(tuple(w for w in words if re.match(r"[^-].*=", w)))
             # What --runs-dir says its key says, too.
-            long = {each for each in names if each[:2] == "--"} - {"--runs-dir"}
-            near = closest(name, long, 0.7)
-            meant = "" if near else Hints(chosen).meant(words, place)
-            meant = meant or f"did you mean {near}?"
-            raise BcrlError(f"{word}: unknown flag; {meant}")
+            long = [x for x in names if x[:2] == "--" and x != "--runs-dir"]
+            if not (near := closest(name, long, 0.7)):
+                raise BcrlError(f"{word}: unknown flag; {hints.meant(words, place)}")
+            raise BcrlError(f"{word}: unknown flag; did you mean {near}?")
     asked = flags.parse_intermixed_args()
     if asked.runs_dir is not None:
         quoted = asked.runs_dir.replace('"', r"\"")
@@ -61,7 +59,7 @@ def for_hydra(asked: Namespace) -> list[str]:
     given = []
     for action in flag_parser()._actions:
         value = getattr(asked, action.dest, None)
-        if value and action.dest not in {*_OURS, "help", "version"}:
+        if value and action.dest not in _OURS:
             short, long = (f(action.option_strings, key=len) for f in (min, max))
             given.append(short if value is True else f"{long}={value}")
     return given
@@ -71,24 +69,18 @@ def flag_parser() -> argparse.ArgumentParser:
     """Hydra's flags and ours."""
     result = get_args_parser()
     result.prog = "bcrl"
-    shown = next(a for a in result._actions if "--version" in a.option_strings)
-    shown.version, shown.help = f"bcrl {__version__}", "show bcrl's version"  # type: ignore
-    about = "explain a key or group; without KEY, list all keys"
-    result.add_argument("--describe", metavar="KEY", nargs="?", const="", help=about)
-    result.add_argument("--dry-run", action="store_true", help="list jobs and costs")
-    result.add_argument("--runs-dir", metavar="PATH", help="as runs_dir=PATH")
-    result.add_argument("--status", action="store_true", help="list what is done")
+    shown: Any = result._option_string_actions["--version"]
+    shown.version = f"bcrl {__version__}"
+    result.add_argument("--describe", nargs="?", const="")
+    result.add_argument("--dry-run", action="store_true")
+    result.add_argument("--runs-dir")
+    result.add_argument("--status", action="store_true")
 
     def reject(message: str) -> NoReturn:
         raise BcrlError(f"{message}; see bcrl --help")
 
     result.error = reject  # type: ignore[method-assign]
     return result
-
-
-def _names(flags: argparse.ArgumentParser) -> list[str]:
-    """Every flag, short ones too."""
-    return [each for action in flags._actions for each in action.option_strings]
 
 
 def _folder(asked: Namespace) -> str | None:
@@ -109,10 +101,10 @@ def short() -> str:
 def manual(config_dir: str | None) -> str:
     """The help, with the options of every group, those of the user's folder too."""
     folders = (config_dir,) if config_dir else ()
-    text = Template(HELP.read_text("utf-8"))
-    names = text.get_identifiers()
-    known = {name: options(name.replace("__", "/"), folders) for name in names}
-    lines = text.substitute({n: ", ".join(known[n]) for n in known}).splitlines()
+    text = Template(Path(__file__).with_name("help.txt").read_text("utf-8"))
+    known = catalog(folders).items()
+    options = {name.replace("/", "__"): ", ".join(each) for name, each in known}
+    lines = text.substitute(options).splitlines()
     hanging = " " * 21  # where an option's text begins
     return "\n".join(textwrap.fill(x, 88, subsequent_indent=hanging) for x in lines)
 
@@ -123,22 +115,22 @@ def completions(line: str) -> list[str]:
     word = words.pop() if words and not line[-1].isspace() else ""
     flags = flag_parser()
     if word.startswith("-"):
-        return sorted(name for name in _names(flags) if name.startswith(word))
+        return sorted(n for n in flags._option_string_actions if n.startswith(word))
     try:
         typed, _ = flags.parse_known_intermixed_args(words)
     except BcrlError:  # a flag's own argument is missing: the shell proposes files
         return []
-    folder = _folder(typed)
-    folders = (folder,) if folder else ()
-    key, equals, _ = word.partition("=")
+    folders = tuple(filter(None, [_folder(typed)]))
+    groups = catalog(folders)
+    key, equals, begun = word.partition("=")
     if equals:
-        found = [f"{key}={option}" for option in options(key, folders)]
-        return [each for each in found if each.startswith(word)]
+        found = [each for each in groups.get(key, ()) if each.startswith(begun)]
+        return [f"{key}={each}" for each in found]
     chosen = any(o.startswith(("env=", "experiment=")) for o in typed.overrides)
     # Without an env nothing composes; most keys are the same in all of them.
     overrides = [o for o in typed.overrides if not o.startswith("hydra.")]
     asked = (*["env=maze"] * (not chosen), *overrides)
-    known = [name for name in group_names(folders) if not name.startswith("tuned")]
+    known = [name for name in groups if not name.startswith("tuned")]
     with contextlib.suppress(BcrlError):  # the command itself says what is wrong
         job: Any = OmegaConf.to_container(composed(asked, folders))
         known += [key for key in flat(job) if not key.startswith("hydra.")]

@@ -3,7 +3,7 @@
 import contextlib
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import takewhile
@@ -16,24 +16,17 @@ from omegaconf import OmegaConf
 
 from bcrl.common.identity import Plain, flat
 from bcrl.config import hydra_compose as compose
+from bcrl.config.describe import entries
 from bcrl.config.overrides import parse
 from bcrl.config.schema import Config
 from bcrl.errors import BcrlError, closest
 
-#: Groups that Hydra would take any option of, known or not.
-OPTIONAL = ("budget", "tuned", "local")
-#: The groups whose options have keys.
-_SECTIONS = ("env", "algorithm", "algorithm/regressor", "boosting", "transfer")
-
-
-def _by_word(table: Mapping[str, str]) -> dict[str, str]:
-    return {word: ours for ours, words in table.items() for word in words.split()}
-
-
 _READ = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text("utf-8"))
-#: Another tool's word → our key; a whole word → what to type; key → word → our value.
-_KEYS, _WORDS = _by_word(_READ["keys"]), _by_word(_READ["words"])
-_VALUES = {key: _by_word(table) for key, table in _READ["values"].items()}
+#: Another tool's word → ours: a key, what to type for a whole word, or a key's value.
+_OURS = {
+    table: {word: ours for ours, words in rows.items() for word in words.split()}
+    for table, rows in _READ.items()
+}
 
 
 @dataclass(frozen=True)
@@ -46,9 +39,7 @@ class Hints:
     @cached_property
     def groups(self) -> dict[str, list[str]]:
         """The options of each group."""
-        names = compose.group_names(self.folders)
-        found = {name: compose.options(name, self.folders) for name in names}
-        return found | {"hydra/launcher": ["slurm"], "hydra/sweeper": ["basic"]}
+        return compose.catalog(self.folders) | {"hydra/sweeper": ["basic"]}
 
     @cached_property
     def present(self) -> Plain:
@@ -56,21 +47,15 @@ class Hints:
         chosen = [o for o in self.overrides if o.partition("=")[0] in self.groups]
         for asked in (tuple(chosen), ("env=maze", *chosen), ("env=maze",)):
             with contextlib.suppress(BcrlError):
-                job = compose.composed(asked, self.folders)
-                values: Any = OmegaConf.to_container(job)
-                return flat({key: values[key] for key in values if key != "hydra"})
+                job: Any = OmegaConf.to_container(compose.composed(asked, self.folders))
+                return flat({key: job[key] for key in job if key != "hydra"})
         return {}
 
     @cached_property
     def brought(self) -> dict[str, str]:
         """The keys that options bring into their section, and the first such option."""
-        found: dict[str, str] = {}
-        for group in _SECTIONS:
-            for name in self.groups[group]:
-                for key in flat(compose.read_option(group, name, self.folders)):
-                    whole = f"{group.replace('/', '.')}.{key}"
-                    found.setdefault(whole, f"{group}={name}")
-        return found
+        known = [e for e in reversed(entries()) if e.group]
+        return {e.key: f"{e.group}={next(iter(e.defaults))}" for e in known}
 
     @cached_property
     def spellings(self) -> dict[str, str]:
@@ -84,7 +69,8 @@ class Hints:
             for form in (parts[-1], f"{parts[0]}.{parts[-1]}", ".".join(parts[-2:])):
                 for each in (form, form.removesuffix("s"), f"{form}s"):
                     found.setdefault(each, name)
-        return found | {w: whole[ours] for w, ours in _KEYS.items() if ours in whole}
+        keys = _OURS["keys"].items()
+        return found | {word: whole[ours] for word, ours in keys if ours in whole}
 
     def line(self, typed: str, value: str | None = None) -> str | None:
         """What to type for a key or a whole word, which may have its value."""
@@ -92,13 +78,9 @@ class Hints:
         text = given if equals else value
         word = re.sub(r"[\s-]", "_", key.strip().lower())
         if text is None:
-            return _WORDS.get(word) or self._alone(key.strip())
+            return _OURS["words"].get(word) or self._alone(key.strip())
         near = closest(word.replace("/", "."), self.spellings, 0.6)
         return self._with(self.spellings[near], text.strip()) if near else None
-
-    def key(self, word: str) -> str:
-        """The key or group that a word means, or ""."""
-        return (self.line(word, "") or "").split(" ")[-1].partition("=")[0]
 
     def _alone(self, word: str) -> str | None:
         """What to type for a word alone: `env=maze` for maze, `tag=x` for `tag: x`."""
@@ -118,10 +100,9 @@ class Hints:
         if key in ("seeds", "seed"):
             return numbers(key, value)
         option = "" if key in self.present else f"{self.brought[key]} "
+        value = _OURS.get(key, {}).get(value.lower(), value)
         usual = self.present.get(key, "…")  # where none was typed
-        value = _VALUES.get(key, {}).get(value.lower(), value)
-        value = value or str({None: "null", "???": "…"}.get(usual, usual))
-        return f"{option}{key}={value}"
+        return f"{option}{key}={value or ('null' if usual is None else usual)}"
 
     def _choice(self, group: str, value: object) -> str | None:
         """`env=maze`, the option of a group that a value means, if there is one."""
@@ -130,7 +111,7 @@ class Hints:
         known = {name.lower(): name for name in self.groups.get(group, ())}
         typed = str(value).strip("'\"[] ").lower().replace("-", "_")
         text = typed.removesuffix("_fqi").removesuffix("_dqn")
-        text = _VALUES.get(group, {}).get(text, text)
+        text = _OURS.get(group, {}).get(text, text)
         if "=" in text:
             return text
         forms = [text, f"fig{text.removeprefix('figure')}"]
@@ -156,17 +137,17 @@ class Hints:
         raw = str(override.input_line).partition("=")[2]
         group, is_text = key.replace(".", "/"), isinstance(value, str)
         if override.is_delete():
-            why = "can't be deleted: every run needs a choice of it, or its default"
-            return why if key in Config.__annotations__ else None
+            needed = key in Config.__annotations__
+            return "every run needs a choice of it, or its default" if needed else None
         if key in self.groups and not isinstance(value, str | Sweep | Glob):
             return f"name one option, or leave {key} out; {self.of_option(key, value)}"
-        if key in OPTIONAL and isinstance(value, str | Sweep):
-            swept = isinstance(value, Sweep)
-            for name in override.sweep_string_iterator() if swept else [value]:
+        optional = key in ("budget", "tuned", "local")  # any option passes in Hydra
+        if optional and isinstance(value, str | Sweep):
+            for name in [value] if is_text else override.sweep_string_iterator():
                 if name not in self.groups.get(key, ()):
                     return f"there is no {name}; {self.of_option(key, name)}"
         seeds = key in ("seed", "seeds") and (is_text or isinstance(value, RangeSweep))
-        habits = {} if key in self.groups else _VALUES.get(key, {})
+        habits = {} if key in self.groups else _OURS.get(key, {})
         dotted = group != key and group in self.groups and is_text
         if (seeds and raw[:2] != "${") or str(value).lower() in habits or dotted:
             return f"did you mean {self._with(group if dotted else key, raw)}?"
@@ -185,11 +166,10 @@ class Hints:
 
     def swept(self) -> str:
         """What to say of several values without -m."""
-        override = next(o for o in parse(self.overrides) if o.is_sweep_override())
-        first, line = override.input_line, shlex.join(["bcrl", "-m", *self.overrides])
-        if override.key_or_group.startswith("seed"):  # more likely one run of them
-            meant = numbers("seeds", str(first))
-            return f"{first}: did you mean {meant}? If a sweep: {line}"
+        swept = (o.input_line for o in parse(self.overrides) if o.is_sweep_override())
+        first, line = str(next(swept)), shlex.join(["bcrl", "-m", *self.overrides])
+        if first.startswith("seed"):  # more likely one run of them
+            return f"{first}: did you mean {numbers('seeds', first)}? A sweep: {line}"
         return f"{first}: several values are a sweep; add -m: {line}"
 
     def explained(self, error: compose.Unknown) -> str:
@@ -207,31 +187,22 @@ class Hints:
         typed = [o for o in self.overrides if o.lstrip("+~").startswith(key)]
         value = typed[-1].partition("=")[2] if typed else ""
         if file := re.match(r"In '([^']*)'", str(error)):
-            near = self.key(key)
-            nested = ": {".join(near.split(".")) + ": …" + "}" * near.count(".")
-            if key in self.groups:
-                nested = f"defaults: [override /{key}: …]"
-            meant = f"did you mean {nested}?" if near else "see bcrl --help"
-            return f"{key}: unknown key in {file[1]}; {meant}"
+            near = (self.line(key, "") or key).split(" ")[-1].partition("=")[0]
+            nested = near.replace(".", ": {") + ": …" + "}" * near.count(".")
+            nested = f"defaults: [override /{key}: …]" if key in self.groups else nested
+            return f"{key}: unknown key in {file[1]}; did you mean {nested}?"
         if key in self.groups:
-            why = "needs no +" if typed[-1][0] == "+" else "is chosen twice"
-            return f"{key}: {why}; {self.mean(key, value)}"
+            return f"{key}: needs no +, and is chosen once; {self.mean(key, value)}"
         if typed and typed[0].startswith("~"):
             return f"{typed[0]}: there is nothing to delete; {key}=null"
-        for parent, there in self.present.items():
-            if key.startswith(f"{parent}."):
-                line = f"+{key}={value}"
-                if there is not None or parent.startswith("env.tasks."):
-                    line = f"'{parent}=[{{{key[len(parent) + 1 :]}: …}}, …]'"
-                why = f"unknown key, for {parent} is {there or 'null'}"
-                return f"{key}: {why}; did you mean {line}?"
-        return f"{key}: unknown key; {self.mean(key, value)}"
+        nulls = (f"{k}." for k, there in self.present.items() if there is None)
+        added = f"did you mean +{key}={value}?" if key.startswith(tuple(nulls)) else ""
+        return f"{key}: unknown key; {added or self.mean(key, value)}"
 
     def of_option(self, group: str, value: object) -> str:
         """`did you mean env=maze?`, and the options."""
-        near, known = self._choice(group, value), self.groups.get(group)
-        listed = f"known: {', '.join(known)}" if known else "see bcrl --help"
-        return f"did you mean {near}? ({listed})" if near else listed
+        near, known = self._choice(group, value), ", ".join(self.groups.get(group, []))
+        return f"did you mean {near}? (known: {known})" if near else f"known: {known}"
 
     def mean(self, word: str, value: str | None) -> str:
         """`did you mean env=maze?`, or where to look."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import yaml
 from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
@@ -31,6 +32,7 @@ UNKNOWN = re.compile(
     r"|Could not delete from config\. '([^']+)' does not exist"
     r"|Multiple values for ([^.\s]+)\."
     r"|In '[^']*': ConfigKeyError .* Key '([^']+)' not in 'Config'"
+    r"|You must specify 'env'"
 )
 Paths = tuple[str, ...]  # of folders of configs, besides our own
 
@@ -51,7 +53,7 @@ def now(pattern: str) -> str:
 
 def register_plugins() -> None:
     """Make the schema known to Hydra, and how folders of configs are read."""
-    schema.register_schema()
+    ConfigStore.instance().store(name="schema", node=schema.Config)
     for plugin in (safety.ConfigFolder, safety.OwnSearchPath):
         Plugins.instance().register(plugin)
     OmegaConf.register_new_resolver("now", now, replace=True)
@@ -60,7 +62,7 @@ def register_plugins() -> None:
 def searchpath(folders: Paths) -> list[str]:
     """The override that adds folders to Hydra's search path, if there are any."""
     quoted = [folder.replace("'", r"\'") for folder in folders]
-    places = [f"'{safety.ConfigFolder.scheme()}://{folder}'" for folder in quoted]
+    places = [f"'bcrl://{folder}'" for folder in quoted]
     return [f"hydra.searchpath=[{','.join(places)}]"] if folders else []
 
 
@@ -87,10 +89,7 @@ def composed(
     except Exception as error:  # e.g. YAML's own; composing runs nothing of ours
         raise BcrlError(f"the configs can't be read: {first_lines(error)}") from error
     if unknown := UNKNOWN.match(message):
-        key = next(filter(None, unknown.groups()))
-        raise Unknown(message if message[:3] == "In " else f"{key}: unknown key", key)
-    if message.startswith("You must specify 'env'"):
-        raise Unknown(message, "")
+        raise Unknown(message, next(filter(None, unknown.groups()), ""))
     raise BcrlError(message)
 
 
@@ -98,10 +97,8 @@ def plain(section: DictConfig) -> Plain:
     """A section with its interpolations resolved, as dicts, lists and scalars."""
     try:
         return OmegaConf.to_container(section, resolve=True, throw_on_missing=True)  # type: ignore
-    except OmegaConfBaseException as error:
+    except (OmegaConfBaseException, RecursionError) as error:  # ${…} of itself
         raise BcrlError(first_lines(error)) from error
-    except RecursionError as error:
-        raise BcrlError("an interpolation, ${…}, refers to itself") from error
 
 
 def first_lines(error: BaseException) -> str:
@@ -116,19 +113,14 @@ def first_lines(error: BaseException) -> str:
     return text if key in text else f"{key}: {text}"
 
 
-def options(group: str, folders: Paths = ()) -> list[str]:
-    """The names of a group's options, ours and those of other folders."""
-    files = (Path(folder, group).glob("*.yaml") for folder in (str(CONF), *folders))
-    return sorted({path.stem for each in files for path in each}, key=str.lower)
-
-
-def group_names(folders: Paths = ()) -> list[str]:
-    """The names of all groups, `env` and `algorithm/regressor` among them."""
-    found: set[str] = set()
+def catalog(folders: Paths = ()) -> dict[str, list[str]]:
+    """The options of each group, `algorithm/regressor` among them, of all folders."""
+    found: dict[str, set[str]] = {}
     for folder in (CONF, *map(Path, folders)):
-        paths = (*folder.glob("*/*.yaml"), *folder.glob("*/*/*.yaml"))
-        found |= {path.parent.relative_to(folder).as_posix() for path in paths}
-    return sorted(found)
+        for path in (*folder.glob("*/*.yaml"), *folder.glob("*/*/*.yaml")):
+            group = path.parent.relative_to(folder).as_posix()
+            found.setdefault(group, set()).add(path.stem)
+    return {group: sorted(found[group], key=str.lower) for group in sorted(found)}
 
 
 @cache

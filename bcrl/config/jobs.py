@@ -23,25 +23,20 @@ from bcrl.config.plan import Plan
 from bcrl.config.schema import VARIANT_GROUPS
 from bcrl.errors import BcrlError, ConfigError, closest
 
-#: The options that follow the authors' code, and the tag of runs that choose them all.
-RELEASED = "released"
-RELEASED_OPTIONS = {"boosting=on": "released", "transfer=shaping": "shaping_released"}
+#: The options that follow the authors' code, all of them with the tag `released`.
+RELEASED = {"boosting=on": "released", "transfer=shaping": "shaping_released"}
 #: The env that a command completes by an id, after which its results are named.
 OPEN = "gymnasium"
 
 
 def plans(arguments: Namespace) -> list[Plan]:
-    """The checked plan of each job that this command line asks for.
-
-    The arguments' overrides are canonical afterwards, their folders absolute.
-    """
-    overrides = list(arguments.overrides)
+    """The jobs' checked plans; the overrides are canonical afterwards."""
+    overrides, multirun = list(arguments.overrides), arguments.multirun
     folders = _folders(arguments)
     Hints(tuple(arguments.overrides), folders).check()
     arguments.overrides = canonical(arguments.overrides, folders)
     hints = Hints(tuple(arguments.overrides), folders)
     parsed = parse(arguments.overrides)
-    multirun = bool(arguments.multirun)
     if multirun and getattr(arguments, "cfg", None):
         raise BcrlError("--cfg shows one composition; drop -m and the sweep")
     swept = {o.key_or_group for o in parsed if o.is_sweep_override()}
@@ -57,21 +52,18 @@ def plans(arguments: Namespace) -> list[Plan]:
             both = multirun or hydra.mode == RunMode.MULTIRUN
             params = _params(hydra, folders) if both else []
             for words in product(params + parse(typed)):
-                job = composed(tuple(words), folders, name)
-                safety.check_composed(job, usual)
-                launcher = job.hydra.launcher
-                schema.check_launcher(launcher and hydra_compose.plain(launcher))
-                found.append(job)
+                found.append(composed(tuple(words), folders, name))
+                safety.check_composed(found[-1], usual)
     except hydra_compose.Unknown as error:
         raise BcrlError(hints.explained(error)) from error
-    if any(_launched(job.hydra) for job in found):
+    # What a folder says is the user's own, unless nobody named the folder.
+    own = not getattr(arguments, "unnamed", False) and bool(folders)
+    made = [_plan(job, folders, None if own else overrides) for job in found]
+    if any(plan.launcher for plan in made):
         if not multirun and found[0].hydra.mode != RunMode.MULTIRUN:
             raise BcrlError("hydra/launcher: a sweep's jobs are launched; add -m")
         if "experiment" in swept:
             raise BcrlError("experiment: with hydra/launcher, one at a time")
-    # What a folder says is the user's own, unless nobody named the folder.
-    own = not getattr(arguments, "unnamed", False) and bool(folders)
-    made = [_plan(job, job.hydra, folders, None if own else overrides) for job in found]
     seen: dict[Path, Plan] = {}
     for new in made:
         old = seen.setdefault(new.directory, new)
@@ -95,8 +87,8 @@ def _folders(arguments: Namespace) -> Paths:
     for folder in folders:
         if not folder.is_dir():
             near = closest(folder.name, [p.name for p in folder.parent.glob("*/")])
-            text = f"--config-dir: there is no folder {folder}"
-            raise BcrlError(f"{text}; did you mean {near}?" if near else text)
+            what = f"did you mean {near}?" if near else "check its name"
+            raise BcrlError(f"--config-dir: there is no folder {folder}; {what}")
     arguments.folders = tuple(map(str, folders))
     return arguments.folders
 
@@ -106,36 +98,27 @@ def _params(hydra: DictConfig, folders: Paths) -> list[Override]:
     swept = hydra.sweeper.get("params") or {}
     for key in map(str, swept):
         if key.lstrip("+~").startswith("hydra"):
-            why = "a config can't sweep over Hydra's own keys"
+            why = "Hydra's own keys can't be swept over"
             raise ConfigError(f"hydra.sweeper.params.{key}", swept[key], why)
-    params = [f"{key}={value}" for key, value in swept.items()]
-    meant = canonical(params, folders)
-    if meant != params:  # Hydra takes them as they are written
-        parts = (each.partition("=") for each in meant)
-        written = ", ".join(f"{key}: '{value}'" for key, _, value in parts)
-        why = f"write {{{written}}} instead of {{{', '.join(params)}}}"
-        raise BcrlError(f"hydra.sweeper.params: {why}")
-    return parse(params)
+    return parse(canonical([f"{key}={swept[key]}" for key in swept], folders))
 
 
-def _plan(
-    job: DictConfig, hydra: DictConfig, folders: Paths, typed: Sequence[str] | None
-) -> Plan:
+def _plan(job: DictConfig, folders: Paths, typed: Sequence[str] | None) -> Plan:
     """A config's plan; `typed` may name code, and all of the config if it is None."""
-    choices = hydra.runtime.choices
-    for group in VARIANT_GROUPS:
-        if choices.get(group) is None:
-            raise BcrlError(f"{group}: every run needs a choice of it")
+    hydra, choices = job.hydra, job.hydra.runtime.choices
+    launcher = hydra.launcher and hydra_compose.plain(hydra.launcher)
+    schema.check_launcher(launcher)
+    launched = launcher["_target_"] != schema.BASIC["_target_"]
     if choices["env"] == OPEN and OmegaConf.is_missing(job.env, "id"):
         raise ConfigError("env.id", "???", "name an environment: env.id=CartPole-v1")
     name = choices.get("variant")
     for entry in read_option("variant", name, folders).get("defaults", ()):
-        for key, option in dict(entry).items():
-            group = key.removeprefix("override /")
-            if choices.get(group, option) != option:
-                why = f"means {group}={option}, but {group}={choices[group]} is chosen"
-                line = f"env={choices['env']} variant={name}"
-                raise ConfigError("variant", name, f"{why}; did you mean {line}?")
+        ((key, option),) = entry.items()
+        group = key.removeprefix("override /")
+        if (other := choices.get(group, option)) != option:
+            line = f"env={choices['env']} variant={name}"
+            why = f"means {group}={option}, not {group}={other}; did you mean {line}?"
+            raise ConfigError("variant", name, why)
     config = _plain(job)
     for key, name in plugins.named_code(config):
         said = (o.lstrip("+").partition("=") for o in typed or ())
@@ -145,10 +128,10 @@ def _plan(
     env = choices["env"]
     if env == OPEN:
         env = str(config["env"]["id"]).rpartition(":")[2].replace("/", "-")
-    launcher = hydra_compose.plain(hydra.launcher) if _launched(hydra) else None
-    tag, command = _tag(config, hydra, folders), _command(hydra, folders)
+    tag, command = _tag(config, hydra, folders), _command(hydra, folders, launched)
+    more = {"command": command, "launcher": launcher if launched else None}
     try:
-        return planning.plan(config, env, tag, command=command, launcher=launcher)
+        return planning.plan(config, env, tag, **more)
     except ConfigError as error:
         option = choices.get(error.key.replace(".", "/"))  # as it was typed
         if option is None or error.key == "env":
@@ -156,17 +139,11 @@ def _plan(
         raise ConfigError(error.key, option, error.allowed) from error
 
 
-def _launched(hydra: DictConfig) -> bool:
-    """Whether a launcher gives the jobs to Slurm."""
-    return hydra.launcher["_target_"] != schema.BASIC["_target_"]
-
-
-def _command(hydra: DictConfig, folders: Paths) -> str:
+def _command(hydra: DictConfig, folders: Paths, launched: bool) -> str:
     """The command that runs one job alone, from Hydra's part of its config."""
-    launched = _launched(hydra)
     left_out = ("hydra.mode=", "hydra.searchpath=")
     asked = [o for o in hydra.overrides.hydra if not o.startswith(left_out)]
-    words = ["bcrl", *(["-m"] if launched else []), *hydra.overrides.task, *asked]
+    words = ["bcrl", *["-m"] * launched, *hydra.overrides.task, *asked]
     if folders:
         words += ["--config-dir", folders[0]]
         words += [f"hydra.searchpath=['{folder}']" for folder in folders[1:]]
@@ -178,36 +155,30 @@ def _command(hydra: DictConfig, folders: Paths) -> str:
 
 
 def _tag(config: Plain, hydra: DictConfig, folders: Paths) -> str | None:
-    """What names a run besides its variant: its tag, `released`, or a digest.
-
-    The config is compared with the shipped options that have its components' names (a
-    user's option `big` that is named fqi with our fqi), in the paper's reading, which
-    needs no tag, and in that of the authors' code.
-    """
+    """The tag: the given one, none for the paper's options, `released`, or a digest."""
     if config["tag"] is not None:
         return config["tag"]
     choices = hydra.runtime.choices
-    usual: dict[str | None, dict[str, str]] = {None: {}, RELEASED: {}}
+    usual: dict[str | None, dict[str, str]] = {None: {}, "released": {}}
     for tag, group in itertools.product(usual, VARIANT_GROUPS[1:]):
         name = config[group].get("name")
         if group in ("curriculum", "boosting"):
             name = "off" if name == "off" else "on"
-        if tag == RELEASED:
-            name = RELEASED_OPTIONS.get(f"{group}={name}", name)
+        if tag:
+            name = RELEASED.get(f"{group}={name}", name)
         shipped = (CONF / group / f"{name}.yaml").exists()
         usual[tag][group] = name if shipped else choices[group]
     if not folders and _only_chooses(hydra):
         for tag, named in usual.items():
             if named.items() <= dict(choices).items():
                 return tag
+    words = [f"env={choices['env']}", "local=none"]
+    if choices["env"] == OPEN:
+        words.append(f"env.id='{config['env']['id']}'")
     changes = []
     for tag, named in usual.items():
-        words = [f"{group}={option}" for group, option in named.items()]
-        if choices["env"] == OPEN:
-            words.append(f"env.id='{config['env']['id']}'")
-        asked = (f"env={choices['env']}", "local=none", *words)
-        other = _plain(composed(asked, folders))
-        changed = differences(config, other)
+        chosen = (f"{group}={option}" for group, option in named.items())
+        changed = differences(config, _plain(composed((*words, *chosen), folders)))
         if not changed:
             return tag
         changes.append({key: value for key, (value, _) in changed.items()})
@@ -221,9 +192,9 @@ def _only_chooses(hydra: DictConfig) -> bool:
     entries = experiment.get("defaults") or ()
     keys = [o.lstrip("+").partition("=")[0] for o in hydra.overrides.task]
     keys += [str(key).removeprefix("override /") for entry in entries for key in entry]
-    same = {"env.id", "variant", "experiment", *VARIANT_GROUPS}
-    only = experiment.keys() <= {"defaults", "hydra", *OUTPUT_KEYS}
-    return only and all(k in same or k.partition(".")[0] in OUTPUT_KEYS for k in keys)
+    same = {"env.id", "variant", "experiment", "defaults", "hydra", *VARIANT_GROUPS}
+    keys += experiment
+    return all(key in same or key.partition(".")[0] in OUTPUT_KEYS for key in keys)
 
 
 def _plain(job: DictConfig) -> Plain:
@@ -235,6 +206,6 @@ def _plain(job: DictConfig) -> Plain:
             why = f"is a section; an option stands in defaults: [override /{key}: …]"
             raise ConfigError(key, config[key], why)
     for key, value in flat(config).items():  # tag=${env.gamma}
-        if key in schema.texts() and not isinstance(value, str | None):
+        if key in schema.TEXTS and not isinstance(value, str | None):
             raise ConfigError(key, value, "must be text: add some to the ${…}")
     return config

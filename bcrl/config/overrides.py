@@ -1,8 +1,4 @@
-"""The overrides of a command line: parsed, written as they are meant, one by one.
-
-Hydra guesses types: `tag=1e3` would be 1000.0. Here a name stays what was typed,
-`seeds=5`, `seeds=[3,7]` and `seed=3` become keys, a folder outside becomes absolute.
-"""
+"""The overrides of a command line, as they are meant: `tag=1e3` is no number."""
 
 import math
 import os
@@ -18,9 +14,9 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
 from bcrl.common.terminal import say
-from bcrl.config.hydra_compose import Paths, first_lines, group_names, now, options
+from bcrl.config.hydra_compose import Paths, catalog, first_lines, now
 from bcrl.config.safety import check_override
-from bcrl.config.schema import section_of_seeds, texts
+from bcrl.config.schema import TEXTS, section_of_seeds
 from bcrl.errors import BcrlError, ConfigError
 
 JOBS = 1_000  # of one sweep
@@ -38,35 +34,27 @@ def parse(overrides: Sequence[str]) -> list[Override]:
         try:
             parsed += parser.parse_overrides([override])
         except (HydraException, ValueError) as error:  # a number of 5000 digits
-            key, _, value = override.partition("=~")
-            home = f"; did you mean {key}=$HOME{value}?" if value else ""
-            text = f"{override!r} can't be read as KEY=VALUE{home}"
+            home = override.replace("=~", "=$HOME")
+            meant = f"; did you mean {home}?" if home != override else ""
+            text = f"{override!r} can't be read as KEY=VALUE{meant}"
             raise BcrlError(text) from error
     return parsed
 
 
 def canonical(overrides: Sequence[str], folders: Paths) -> list[str]:
     """The overrides as Hydra should read them; what is canonical stays as it is."""
+    if "hydra/launcher=local" in overrides:  # a former launcher
+        say("hydra/launcher=local: this launcher is gone; workers=N takes its place")
+        renamed = [o.replace("hydra.launcher.n_jobs=", "workers=") for o in overrides]
+        overrides = [o for o in renamed if not re.match("hydra[/.]launcher", o)]
+        if not any(o.startswith("workers=") for o in overrides):
+            overrides.append(f"workers={os.cpu_count()}")
     found: dict[str, str] = {}  # of a key of seeds the last one holds
-    for each in _without_local(overrides):
-        for text in _canonical(each, folders):
-            key = text.partition("=")[0]
-            key = key if key.startswith("seeds.") else text
-            found.pop(key, None)
-            found[key] = text
+    for text in (text for each in overrides for text in _canonical(each, folders)):
+        key = text.partition("=")[0] if text.startswith("seeds.") else text
+        found.pop(key, None)
+        found[key] = text
     return list(found.values())
-
-
-def _without_local(overrides: Sequence[str]) -> Sequence[str]:
-    """The overrides, with workers in place of the former launcher `local`."""
-    if "hydra/launcher=local" not in overrides:
-        return overrides
-    typed = [o.partition("n_jobs=")[2] for o in overrides if "launcher.n_jobs=" in o]
-    line = f"workers={next(filter(str.isdecimal, typed), os.cpu_count())}"
-    say(f"hydra/launcher=local: this launcher is gone; the command runs with {line}")
-    launcher = ("hydra/launcher=", "hydra.launcher.")
-    chosen = [o for o in overrides if not o.startswith(launcher)]
-    return chosen if any(o.startswith("workers=") for o in chosen) else [*chosen, line]
 
 
 def _canonical(text: str, folders: Paths) -> Iterator[str]:
@@ -74,7 +62,7 @@ def _canonical(text: str, folders: Paths) -> Iterator[str]:
     (override,) = parse([text])
     key, value = override.key_or_group, override.value()
     head, equals, raw = text.partition("=")
-    is_group = key in group_names(folders)
+    known = catalog(folders).get(key, [])  # a group's options
     swept = isinstance(value, types.ChoiceSweep)
     values: list[Any] = value.list if swept else [value]  # type: ignore[union-attr]
     if override.is_delete() or not equals:
@@ -88,21 +76,18 @@ def _canonical(text: str, folders: Paths) -> Iterator[str]:
             those = [str(section[name]).replace(" ", "") for section in sections]
             yield f"seeds.{name}={'null' if those[0] == 'None' else ','.join(those)}"
     elif isinstance(value, types.Glob):
-        known = options(key, folders) if is_group else ["no group"]
-        names = value.filter(known) if is_group else []
+        names = value.filter(known)
         if not names:
             why = f"glob(…) picks options of a group; {key} has {', '.join(known)}"
             raise ConfigError(key, raw, why)
         yield from _canonical(f"{head}={','.join(names)}", folders)
-    elif COMPUTED.match(raw) or (is_group and isinstance(value, list)):
-        yield text
-    elif is_group or key in texts() or key.endswith((".name", ".id")):
+    else:
+        is_text = known or key in TEXTS or key.endswith((".name", ".id"))
         written = CHOICE.sub(r"\1\2", raw).split(",") if swept else [raw]
-        if len(written) == len(values):
+        kept = COMPUTED.match(raw) or (known and isinstance(value, list))
+        if is_text and not kept and len(written) == len(values):
             each = (_as_text(w, v, key) for w, v in zip(written, values, strict=True))
             text = f"{head}={','.join(each)}"
-        yield text
-    else:
         yield text
 
 
@@ -121,11 +106,10 @@ def product(overrides: Sequence[Override]) -> list[list[str]]:
     jobs = 1.0
     for override in overrides:
         sweep = override.value()
+        why = f"a sweep of more than {JOBS} jobs, or of none"
         if isinstance(sweep, types.IntervalSweep):
-            line = f"-m {override.key_or_group}=0.1,0.5"
-            why = f"an interval can't be swept over; did you mean {line}?"
-            raise BcrlError(f"{override.input_line}: {why}")
-        if isinstance(sweep, types.ChoiceSweep):
+            jobs, why = 0, f"no interval; did you mean {override.key_or_group}=0.1,0.5?"
+        elif isinstance(sweep, types.ChoiceSweep):
             jobs *= len(sweep.list)
         elif isinstance(sweep, types.RangeSweep):
             try:
@@ -133,7 +117,6 @@ def product(overrides: Sequence[Override]) -> list[list[str]]:
             except (ArithmeticError, TypeError):  # a step of 0, a number out of range
                 jobs = math.inf
         if not 0 < jobs <= JOBS:
-            why = f"a sweep of more than {JOBS} jobs, or of none"
             raise BcrlError(f"{override.input_line}: {why}")
     try:
         return BasicSweeper.split_arguments(list(overrides), None)[0]

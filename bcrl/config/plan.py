@@ -1,7 +1,7 @@
 """From a composed configuration to a plan: stages, transfers, variant, directory."""
 
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -72,24 +72,22 @@ def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
     _check_outputs(config, tag)
     check_name("env", env)
     tasks, metrics = _tasks(config["env"])
-    section = config["algorithm"]
-    name = str(section.get("name"))
-    chosen_algorithm = algorithm(name)
+    module = algorithm(str(config["algorithm"].get("name")))
     chosen = composition(config, tasks)
-    stages = chosen_algorithm.stages(section, chosen)
+    stages = module.stages(config["algorithm"], chosen)
     asked = _asked(config["seeds"])
     return Plan(
         env=env,
-        variant=_variant(name, chosen),
+        variant=_variant(config["algorithm"]["name"], chosen),
         tag=tag,
-        family=chosen_algorithm.FAMILY,
+        family=module.FAMILY,
         stages=stages,
         tasks=tuple(tasks),
         metrics=metrics,
         asked=asked,
         seeds=part(asked, config["seeds"]["part"]),
-        lockstep=config["seeds"]["lockstep"] or chosen_algorithm.LOCKSTEP,
-        device=usable_device(config["device"], chosen_algorithm.FAMILY),
+        lockstep=config["seeds"]["lockstep"] or module.LOCKSTEP,
+        device=usable_device(config["device"], module.FAMILY),
         config=config,
         sources=plugins.fingerprint(config),
         **more,
@@ -98,13 +96,12 @@ def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
 
 def _asked(section: Plain) -> tuple[int, ...]:
     """All seeds: so many from the first on, or those that are listed."""
-    listed = section.get("only")
-    if section.get("count") is not None:
+    listed = section["only"] or []
+    if section["count"] is not None:
         return tuple(range(section["first"], section["first"] + section["count"]))
-    if not listed or len(set(listed)) < len(listed) or min(listed) < 0:
-        raise ConfigError("seeds.only", listed, "must be different seeds: seeds=[3,7]")
-    if max(listed) > 2**32 or len(listed) > 10**6:
-        raise ConfigError("seeds.only", listed, "must be from 0 to 2^32, at most 10^6")
+    different = 0 < len(listed) == len(set(listed)) <= 10**6
+    if not different or min(listed) < 0 or max(listed) > 2**32:
+        raise ConfigError("seeds.only", listed, "must differ, 0 to 2^32: seeds=[3,7]")
     return tuple(sorted(listed))
 
 
@@ -117,23 +114,21 @@ def part(seeds: tuple[int, ...], which: str | None) -> tuple[int, ...]:
     if not 1 <= number <= parts <= len(seeds):
         why = f"must be K/N, the K-th of at most {len(seeds)} parts, such as 1/2"
         raise ConfigError("seeds.part", which, why)
-    first, after = ((k * len(seeds)) // parts for k in (number - 1, number))
-    return seeds[first:after]
+    return seeds[(number - 1) * len(seeds) // parts : number * len(seeds) // parts]
 
 
 def _variant(algorithm_name: str, chosen: Composition) -> str:
     """`SBC-DQN` and the like; policy reuse and residual policy by their own names."""
-    prefix = "S" * isinstance(chosen.transfer, Shape)
-    prefix += "B" * (chosen.boost is not None) + "C" * (not chosen.target_only)
-    name = algorithm_name.rpartition(".")[2].upper()
-    whole = f"{prefix}-{name}" if prefix else name
-    if isinstance(chosen.transfer, ResidualPolicy):
+    transfer = chosen.transfer
+    prefix = "S" * isinstance(transfer, Shape) + "B" * (chosen.boost is not None)
+    prefix += "C" * (not chosen.target_only)
+    whole = f"{prefix}-{algorithm_name.rpartition('.')[2].upper()}".lstrip("-")
+    if isinstance(transfer, ResidualPolicy):
         return "RPL"
-    if isinstance(chosen.transfer, PolicyReuse):
+    if isinstance(transfer, PolicyReuse):
         return f"PPR-{whole}" if chosen.boost else "PPR"
-    if chosen.transfer is None or isinstance(chosen.transfer, Shape):
-        return whole
-    return f"{type(chosen.transfer).__name__}-{whole}"  # the user's own
+    own = transfer is not None and not isinstance(transfer, Shape)
+    return f"{type(transfer).__name__}-{whole}" if own else whole
 
 
 def usable_device(wanted: str, family: str) -> str:
@@ -143,18 +138,18 @@ def usable_device(wanted: str, family: str) -> str:
         return "cpu"  # forests grow on the CPU
     import torch
 
-    there = torch.cuda.is_available()
-    if wanted == "cuda" and not there:
+    if torch.cuda.is_available():
+        return "cuda"
+    if wanted == "cuda":
         raise ConfigError("device", "cuda", "torch finds no CUDA device; device=cpu")
-    return "cuda" if there else "cpu"
+    return "cpu"
 
 
 def _check_outputs(config: Plain, tag: str | None) -> None:
     """Raise ConfigError for what the keys outside of the groups can't be."""
-    known = [f.name for f in fields(Config)]
-    for key, value in config.items():
-        if key not in known:
-            raise ConfigError(key, value, f"unknown key; {did_you_mean(key, known)}")
+    known = Config.__annotations__
+    for key in config.keys() - known:
+        raise ConfigError(key, config[key], f"unknown key; {did_you_mean(key, known)}")
     construct("curriculum", Choice, config["curriculum"])
     for section in ("seeds", "scale", ""):
         values = config[section] if section else config
@@ -169,9 +164,8 @@ def _check_outputs(config: Plain, tag: str | None) -> None:
 
 def _tasks(section: Plain) -> tuple[list[Env], tuple[str, ...]]:
     """The environment's tasks, easiest first, and the metrics to record."""
-    tasks = tasks_of(section)
+    tasks, metrics = tasks_of(section), section.get("metrics")
     check_tasks(section["name"], tasks)
-    metrics = section.get("metrics")
     if not isinstance(metrics, list) or not metrics:
         raise ConfigError("env.metrics", metrics, "must be a list of metric names")
     check_metrics(metrics, tasks[-1])

@@ -1,8 +1,4 @@
-"""The rule book: which learners, tasks and transfers make a course of stages.
-
-The command line and `bcrl.api` both make their stages here, so what one of them makes
-or rejects, the other does, too.
-"""
+"""The rule book of courses, from which the command line and `bcrl.api` make stages."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,6 +8,7 @@ from numbers import Integral, Real
 from typing import Any, cast
 
 from bcrl.common.checks import one_of
+from bcrl.common.identity import Plain
 from bcrl.config.variant import Composition
 from bcrl.envs import Env, is_finite
 from bcrl.errors import ConfigError
@@ -23,25 +20,18 @@ from bcrl.learning.transfer import Boost, Shape, StageInit, warm_start
 from bcrl.q.functions import ZERO
 from bcrl.q.quadratic import FEATURES
 
-_COUNTS = (
-    *("iterations", "episodes", "steps", "target_update", "batch_size", "replay_size"),
-    *("evaluate_every", "evaluation_episodes", "lockstep", "workers", "threads"),
-    *("max_iterations", "max_episodes", "max_steps"),
-)
-_STEPS = ("random_steps", "learning_starts", "anneal_steps")
-_PROBABILITIES = ("epsilon", "epsilon_start", "evaluation_epsilon")
-_POSITIVE = ("learning_rate", "noise_std", "checkpoint_every")
 ABOVE_0 = math.nextafter(0.0, 1.0)
-#: A setting's type, its least and its greatest value.
-BOUNDS = {
-    **dict.fromkeys(_COUNTS, (Integral, 1, math.inf)),
-    **dict.fromkeys(_STEPS, (Integral, 0, math.inf)),
-    **dict.fromkeys(_PROBABILITIES, (Real, 0, 1)),
-    **dict.fromkeys(_POSITIVE, (Real, ABOVE_0, math.inf)),
-    **{"first": (Integral, 0, 2**32), "count": (Integral, 1, 10**6)},
-}
-#: What FQI knows of shaping: none, or the paper's.
-SHAPES = (None, Shape())
+#: A type, the least and the greatest value, and the settings that have them.
+BOUNDS: tuple[tuple[Any, float, float, str], ...] = (
+    (Integral, 1, math.inf, "iterations episodes steps target_update batch_size"),
+    (Integral, 1, math.inf, "replay_size evaluate_every evaluation_episodes lockstep"),
+    (Integral, 1, math.inf, "workers threads max_iterations max_episodes max_steps"),
+    (Integral, 0, math.inf, "random_steps learning_starts anneal_steps"),
+    (Real, 0, 1, "epsilon epsilon_start evaluation_epsilon"),
+    (Real, ABOVE_0, math.inf, "learning_rate noise_std checkpoint_every"),
+    (Integral, 0, 2**32, "first"),
+    (Integral, 1, 10**6, "count"),
+)
 #: Settings that a warm start passes on, so that they can't differ between slots.
 PASSED_ON = {FQI: ("regressor",), DQN: ("hidden", "learning_rate")}
 
@@ -49,9 +39,9 @@ PASSED_ON = {FQI: ("regressor",), DQN: ("hidden", "learning_rate")}
 def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...]:
     """The stages of a composition, given the learner of each slot.
 
-    One stage per slot. Plain DQN has one in all, with the steps of all slots and the
-    other settings of the last: its networks, task and replay stay the same. Raises
-    ConfigError for what can't be learned, or would have no effect.
+    One stage per slot; plain DQN has one in all, with the steps of all slots and the
+    other settings of the last. The scale caps the budgets. Raises ConfigError for what
+    can't be learned, or would have no effect.
     """
     chosen.check()
     _check(chosen, learners)
@@ -72,21 +62,19 @@ def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...
         if isinstance(learner, DQN) and made and has_policy:
             learner = replace(learner, random_steps=0)
         made.append(Stage(number, task + 1, env, learner, chosen.transfers, 0))
-    return _placed(made)
+    ready = [_capped(stage.learner, chosen.scale) for stage in made]
+    before = accumulate((learner.length for learner in ready), initial=0)
+    each = zip(made, ready, before, strict=False)
+    return tuple(replace(stage, learner=x, before=n) for stage, x, n in each)
 
 
-def capped(
-    stages: Sequence[Stage], kind: type[FQI] | type[DQN], **most: int | None
-) -> tuple[Stage, ...]:
-    """The stages with a scale's caps on the budgets of one kind of learner."""
-    made = []
-    for stage in stages:
-        learner = stage.learner
-        if isinstance(learner, kind):
-            caps = {k: min(getattr(learner, k), cap) for k, cap in most.items() if cap}
-            learner = replace(learner, **caps)
-        made.append(replace(stage, learner=learner))
-    return _placed(made)
+def _capped(learner: Learner, scale: Plain) -> Learner:
+    """A learner of ours with a scale's caps on its budget, which LSPI has none of."""
+    if not isinstance(learner, FQI | DQN):
+        return learner
+    caps = {k: scale.get(f"max_{k}") for k in ("iterations", "episodes", "steps")}
+    own = vars(learner).items()
+    return replace(learner, **{k: min(v, caps[k]) for k, v in own if caps.get(k)})
 
 
 def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
@@ -119,9 +107,7 @@ def _check_fqi(chosen: Composition, learner: FQI, env: Env, start: StageInit) ->
     regressor, why = learner.regressor, ""
     key, value = "algorithm.regressor", cast(Any, regressor)
     if isinstance(regressor, type) or not hasattr(regressor, "finite_only"):
-        why = (
-            "is no regressor of bcrl's; Sklearn(estimator) makes one of scikit-learn's"
-        )
+        why = "is no regressor of ours; Sklearn(estimator) makes one of scikit-learn's"
     elif regressor.finite_only and not is_finite(env):
         why = f"needs finitely many states, which {env.name} has not"
     elif learner.shared_data and learner.epsilon < 1:
@@ -130,7 +116,7 @@ def _check_fqi(chosen: Composition, learner: FQI, env: Env, start: StageInit) ->
     elif chosen.boost and start.boost != Boost():
         key, value = "boosting", chosen.boost
         why = "is the released DQN's; FQI learns with the paper's, boosting=on"
-    elif (start.behavior, start.boost) != (None, Boost()) or start.shape not in SHAPES:
+    elif start.behavior or (start.boost, start.shape or Shape()) != (Boost(), Shape()):
         key, value = "transfer", chosen.transfer
         why = "is for algorithm=dqn; FQI learns with transfer=shaping, or without one"
     if why:
@@ -142,34 +128,29 @@ def _check_dqn(chosen: Composition, learner: DQN, start: StageInit) -> None:
     size, widths, why = learner.replay_size, learner.hidden, ""
     key, value = "algorithm.replay_size", cast(Any, size)
     if size < learner.batch_size or size <= learner.learning_starts:
-        why = f"must hold a batch, batch_size={learner.batch_size}, and more than "
-        why += f"learning_starts={learner.learning_starts}"
+        why = f"must hold a batch and exceed learning_starts={learner.learning_starts}"
     elif not widths or not all(isinstance(w, Integral) and w >= 1 for w in widths):
         key, value = "algorithm.hidden", list(widths)
         why = "must be a list of layer widths, each at least 1"
     elif start.initial is not ZERO and chosen.transfers != (warm_start,):
         key, value = "transfer", chosen.transfer
-        why = "sets `initial`, but DQN starts from networks: set `base`, `potential` "
-        why += "or `prior`"
+        why = "sets `initial`, but DQN needs networks there: set `base` or `prior`"
     if why:
         raise ConfigError(key, value, why)
 
 
 def _check_slot(chosen: Composition, lspi: LSPI, slot: int, start: StageInit) -> None:
-    env = chosen.slots[slot]
+    check_lspi(lspi)
+    env, why = chosen.slots[slot], ""
     if getattr(env, "linear_quadratic", None) is None or not hasattr(env, "push"):
-        why = "learns quadratic Q-functions of continuous actions, but "
-        why += f"{env} is no linear-quadratic task"
+        why = f"learns quadratic Q-functions, but {env} is no linear-quadratic task"
     elif start.initial is not ZERO:
         why = "leaves no network to start DQN's from: boosting=on or a transfer needed"
     elif slot:
-        why = f"starts from nothing, so slot {slot + 1} would drop what the one before "
-        why += "has learned: LSPI in the first slot, DQN in the others"
-    else:
-        check_lspi(lspi)
-        lspi.episodes_per_iteration(env)  # says whether they are whole
-        return
-    raise ConfigError("algorithm.learners", lspi.name, why)
+        why = "starts from nothing: LSPI in the first slot only, DQN in the others"
+    if why:
+        raise ConfigError("algorithm.learners", lspi.name, why)
+    lspi.episodes_per_iteration(env)  # says whether they are whole
 
 
 def check_lspi(learner: LSPI) -> None:
@@ -180,15 +161,16 @@ def check_lspi(learner: LSPI) -> None:
 
 def check_numbers(section: str, values: Mapping[str, Any]) -> None:
     """Raise ConfigError for a setting out of its bounds."""
-    for name, (kind, least, most) in BOUNDS.items():
-        value = values.get(name, least)
-        fits = isinstance(value, kind) and not isinstance(value, bool)
-        if not fits or not least <= value <= most or value == math.inf:
-            noun = "an integer" if kind is Integral else "a number"
-            bounds = f"of at least {least}" if least != ABOVE_0 else "above 0"
-            bounds = f"from {least} to {most}" if most < math.inf else bounds
-            key = f"{section}.{name}".lstrip(".")
-            raise ConfigError(key, value, f"must be {noun} {bounds}")
+    for kind, least, most, names in BOUNDS:
+        for name in (each for each in names.split() if each in values):
+            value = values[name]
+            fits = isinstance(value, kind) and not isinstance(value, bool)
+            if not fits or not least <= value <= most or value == math.inf:
+                noun = "an integer" if kind is Integral else "a number"
+                bounds = f"of at least {least}" if least != ABOVE_0 else "above 0"
+                bounds = f"from {least} to {most}" if most < math.inf else bounds
+                key = f"{section}.{name}".lstrip(".")
+                raise ConfigError(key, value, f"must be {noun} {bounds}")
 
 
 def _with_data(learner: FQI, env: Env, before: Sequence[Stage]) -> FQI:
@@ -200,9 +182,3 @@ def _with_data(learner: FQI, env: Env, before: Sequence[Stage]) -> FQI:
         why = "the task's data are kept, so epsilon and episodes must stay the same"
         raise ConfigError("algorithm.new_data", "task", why)
     return learner
-
-
-def _placed(stages: Sequence[Stage]) -> tuple[Stage, ...]:
-    """Stages whose `before` counts what the ones before them take."""
-    lengths = accumulate((stage.learner.length for stage in stages), initial=0)
-    return tuple(replace(s, before=n) for s, n in zip(stages, lengths, strict=False))

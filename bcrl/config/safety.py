@@ -22,10 +22,7 @@ NODES, DEPTH = 10_000, 40  # values of one YAML, levels of nested sections or br
 #: Aliases of a YAML and interpolations of a config: each may repeat a large value.
 REPEATS = 16
 #: The tags that JSON has, too; others make objects.
-TAGS = {None, "!"} | {
-    f"tag:yaml.org,2002:{kind}"
-    for kind in ("null", "bool", "int", "float", "str", "seq", "map")
-}
+TAGS = re.compile(r"!|tag:yaml\.org,2002:(null|bool|int|float|str|seq|map)|None")
 #: References and two resolvers that give text. Others make config out of text.
 INTERPOLATION = re.compile(
     r"\$\{\s*(?:(?!hydra\.)\.*[\w.\[\]-]+|(?:oc\.env|now)\s*:[^${}]*)\s*\}"
@@ -52,18 +49,16 @@ class ConfigFolder(FileConfigSource):
         if os.path.isabs(name) or name.startswith(".."):
             raise BcrlError(f"{config_path}: leads out of the folder {self.path}")
         if self.provider == "main":  # ours, which every job of a sweep reads
-            place = os.path.join(self.path, name)
-            if place not in _OURS:
-                _OURS[place] = super().load_config(config_path)
-            return copy.deepcopy(_OURS[place])
+            if name not in _OURS:
+                _OURS[name] = super().load_config(config_path)
+            return copy.deepcopy(_OURS[name])
         check_file(Path(self.path, name))
         loaded = super().load_config(config_path)
         package = loaded.header.get("package") or os.path.dirname(name)
         if isinstance(loaded.config, DictConfig):
             schema.check_written(package, loaded.config)
             if OmegaConf.select(loaded.config, "hydra.searchpath") is not None:
-                why = "only the command line names folders of configs: --config-dir"
-                raise BcrlError(f"hydra.searchpath in {config_path}: {why}")
+                raise BcrlError(f"hydra.searchpath in {config_path}: use --config-dir")
         return loaded
 
 
@@ -74,37 +69,29 @@ class OwnSearchPath(SearchPathPlugin):
         """Change the place of the main configs."""
         for place in search_path.get_path():
             if place.provider == "main":
-                path = (place.path or "").removeprefix("file://")
-                place.path = f"{ConfigFolder.scheme()}://{path}"
+                place.path = "bcrl://" + (place.path or "").removeprefix("file://")
 
 
 def check_override(text: str) -> None:
     """Raise BcrlError for an override that a parser would choke on."""
-    short = repr(text if len(text) <= 60 else text[:57] + "…")
-    try:
-        text.encode()
-    except UnicodeEncodeError as error:
-        raise BcrlError(f"{short} isn't valid UTF-8") from error
-    if len(text) > OVERRIDE:
-        raise BcrlError(f"{short} is longer than {OVERRIDE} characters; use a YAML")
-    opening = sum(text.count(bracket) for bracket in "[({")
-    if max(opening, text.partition("=")[0].count(".")) > DEPTH:
-        raise BcrlError(f"{short} has more than {DEPTH} brackets or nested keys")
+    short = repr(text[:60])
+    if re.search("[\ud800-\udfff]", text):
+        raise BcrlError(f"{short} isn't valid UTF-8")
+    levels = max(len(re.findall(r"[\[({]", text)), text.partition("=")[0].count("."))
+    if len(text) > OVERRIDE or levels > DEPTH:
+        most = f"{OVERRIDE} characters, {DEPTH} brackets or {DEPTH} nested keys"
+        raise BcrlError(f"{short} is longer than {most}")
 
 
 def check_file(path: Path) -> None:
     """Raise BcrlError for a file that isn't plain, small YAML in UTF-8."""
-    if not path.is_file():  # a pipe would never end
-        raise BcrlError(f"{path} is no regular file")
-    if path.stat().st_size > FILE_BYTES:
-        raise BcrlError(f"{path} is larger than {FILE_BYTES // 1024} KiB")
+    if not path.is_file() or path.stat().st_size > FILE_BYTES:  # a pipe never ends
+        raise BcrlError(f"{path} is no file of at most {FILE_BYTES // 1024} KiB")
     try:
         check_yaml(path.read_text("utf-8"))
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
+    except (UnicodeDecodeError, yaml.YAMLError, BcrlError) as error:
         words = " ".join(str(error).split())
         raise BcrlError(f"{path} can't be read: {words}") from error
-    except BcrlError as error:
-        raise BcrlError(f"{path} {error}") from error
 
 
 def check_yaml(text: str) -> None:
@@ -118,16 +105,16 @@ def check_yaml(text: str) -> None:
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if nodes > NODES or depth > DEPTH or aliases > REPEATS:
             most = f"{NODES} values, {DEPTH} levels and {REPEATS} aliases"
-            raise BcrlError(f"is too large: at most {most} are read")
-        if getattr(event, "tag", None) not in TAGS:
-            raise BcrlError(f"has the tag {event.tag!r}; only plain values can be read")
+            raise BcrlError(f"it is too large: at most {most} are read")
+        if not TAGS.fullmatch(str(getattr(event, "tag", None))):
+            raise BcrlError(f"it has the tag {event.tag!r}; only plain values are read")
         if isinstance(event, yaml.ScalarEvent) and event.implicit[0]:
             word = event.value
             kind = resolver.resolve(yaml.ScalarNode, word, (True, False))[-5:]
             odd = kind == ":bool" and word.lower() not in ("true", "false")
             digits = kind in ("2:int", "float")
             if odd or (digits and re.search("[:_xb]|^[+-]?0[0-9]", word)):
-                why = f"has a bare {word}, which YAML reads as {yaml.safe_load(word)}"
+                why = f"it has a bare {word}, read as {yaml.safe_load(word)} by YAML"
                 raise BcrlError(f"{why}; write what is meant, or quote it as a name")
 
 
@@ -150,9 +137,7 @@ def check_composed(composed: DictConfig, usual: DictConfig | None) -> None:
     for key, value in flat(config | {"hydra": set_here}).items():
         for start in re.finditer(r"\$\{", text := str(value)):
             found += 1
-            if not INTERPOLATION.match(text, start.start()):
-                why = "only ${key}, ${oc.env:NAME} and ${now:…} are allowed, not nested"
-                raise ConfigError(key, text, f"{why}, and none of Hydra's own keys")
-            if found > REPEATS:
-                why = f"a config has at most {REPEATS} interpolations"
+            if found > REPEATS or not INTERPOLATION.match(text, start.start()):
+                why = f"a config may have {REPEATS} of ${{key}}, ${{oc.env:NAME}} and "
+                why += "${now:…}, not nested, and none of Hydra's own keys"
                 raise ConfigError(key, text, why)

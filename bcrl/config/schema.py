@@ -1,13 +1,12 @@
 """The configuration's schema, and checks that name key, value and what is allowed."""
 
+import math
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, is_dataclass
-from functools import cache
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import PurePath
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_type_hints
 
-from hydra.core.config_store import ConfigStore
 from hydra_plugins.hydra_submitit_launcher.config import SlurmQueueConf
 from omegaconf import MISSING, DictConfig, OmegaConf
 
@@ -17,6 +16,11 @@ from bcrl.errors import ConfigError, at_least
 
 #: The choices that make a variant.
 VARIANT_GROUPS = ("env", "algorithm", "curriculum", "boosting", "transfer", "scale")
+_OF_SLURM = get_type_hints(SlurmQueueConf).items()
+#: The keys whose values are text, those of Slurm's launcher among them.
+TEXTS = {f"hydra.launcher.{k}" for k, hint in _OF_SLURM if hint in (str, str | None)}
+TEXTS |= {"curriculum.name", "device", "progress", "runs_dir", "scale.name"}
+TEXTS |= {"seeds.part", "tag"}
 
 
 @dataclass
@@ -69,11 +73,6 @@ class Config:
     checkpoint_every: float = 60.0
 
 
-def register_schema() -> None:
-    """Make the schema known to Hydra as `schema`."""
-    ConfigStore.instance().store(name="schema", node=Config)
-
-
 def section_of_seeds(key: str, value: object) -> dict[str, Any]:
     """`seeds=5`, `seeds=[3,7]` and `seed=3` as keys of the section `seeds`."""
     if type(value) is int or (isinstance(value, str) and value.startswith("${")):
@@ -88,40 +87,21 @@ def section_of_seeds(key: str, value: object) -> dict[str, Any]:
 
 
 def check_written(package: str, config: DictConfig) -> None:
-    """Check what a file says of seeds and texts; `seeds: 5` becomes the section's keys.
-
-    Raises ConfigError for seeds named twice, and for a number as text: `tag: 1e3`.
-    """
+    """Check a file's seeds and texts; `seeds: 5` becomes the keys of its section."""
     place = "" if package in ("", "_global_") else package.replace("/", ".") + "."
-    if not place and None not in (config.get("seed"), config.get("seeds")):
-        raise ConfigError("seed", config["seed"], "seeds is given, too; keep one")
-    for key in ("seed", "seeds") if not place else ():
-        if config.get(key) is not None:
-            value = OmegaConf.to_container(config, resolve=False).pop(key)  # type: ignore
-            del config[key]
-            config["seeds"] = section_of_seeds(key, value)
     values: Any = OmegaConf.to_container(config, resolve=False)
+    named = [] if place else [k for k in ("seed", "seeds") if values.get(k) is not None]
+    if len(named) == 2:
+        raise ConfigError("seed", values["seed"], "seeds is given, too; keep one")
+    for key in named:
+        del config[key]
+        values["seeds"] = section_of_seeds(key, values.pop(key))
+        config["seeds"] = values["seeds"]
     for key, value in flat(values).items():
-        if isinstance(value, (int, float)) and f"{place}{key}" in texts():
+        if isinstance(value, (int, float)) and f"{place}{key}" in TEXTS:
             raise ConfigError(f"{place}{key}", value, "quote it where it is a name")
 
 
-@cache
-def texts() -> frozenset[str]:
-    """The keys that a schema declares as text, ours and those of Slurm's launcher."""
-
-    def of(cls: Any, prefix: str) -> Iterator[str]:
-        for name, hint in get_type_hints(cls).items():
-            if hint is str or get_args(hint) == (str, type(None)):
-                yield f"{prefix}{name}"
-            elif is_dataclass(hint):
-                yield from of(hint, f"{prefix}{name}.")
-
-    return frozenset({*of(Config, ""), *of(SlurmQueueConf, "hydra.launcher.")})
-
-
-NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{,99}")
-COMPONENT, PARTS = 200, 50  # bytes of a part of a path, and how many parts
 BASIC = {"_target_": "hydra._internal.core_plugins.basic_launcher.BasicLauncher"}
 
 
@@ -136,8 +116,7 @@ def check_launcher(values: Plain | None) -> None:
     if values == BASIC:
         return
     if values.get("_target_") != SlurmQueueConf._target_:
-        why = "can't be instantiated; hydra/launcher=slurm, or workers=2 without a "
-        why += "launcher for two of this machine's cores"
+        why = "can't be used; hydra/launcher=slurm, or workers=2 without a launcher"
         raise ConfigError("hydra.launcher._target_", values.get("_target_"), why)
     construct("hydra.launcher", _Slurm, values)
     for key, value in values.items():
@@ -154,15 +133,14 @@ def check_launcher(values: Plain | None) -> None:
             at_least(name, value, key not in ("max_num_timeout", "signal_delay_s"))
         if key == "submitit_folder":
             check_path(name, value)
-    delay, limit = (values.get(key, 0) for key in ("signal_delay_s", "timeout_min"))
-    if limit and delay >= 60 * limit:
-        why = f"leaves nothing of timeout_min={limit} minutes"
-        raise ConfigError("hydra.launcher.signal_delay_s", delay, why)
+    delay, limit = values.get("signal_delay_s", 0), values.get("timeout_min", math.inf)
+    if delay >= 60 * limit:
+        raise ConfigError("hydra.launcher.signal_delay_s", delay, "exceeds timeout_min")
 
 
 def check_name(key: str, text: str) -> None:
     """Raise ConfigError for what isn't a plain name of a file or folder."""
-    if not NAME.fullmatch(text):
+    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{,99}", text):
         why = "must be a plain name of at most 100 letters, digits, '.', '_' and '-'"
         raise ConfigError(key, text[:40], why)
 
@@ -170,13 +148,13 @@ def check_name(key: str, text: str) -> None:
 def check_path(key: str, text: str) -> None:
     """Raise ConfigError for a path that leads out of this folder, or can't be made."""
     path = PurePath(text)
-    longest = max((len(part.encode()) for part in path.parts), default=0)
+    longest = max((len(part.encode()) for part in path.parts), default=0)  # bytes
     for wrong, why in (
         (not text.strip(), "must name a folder"),
         (text.startswith("~"), "~ isn't expanded; write $HOME or the whole path"),
         (".." in path.parts and not path.is_absolute(), "leads out of this folder"),
         (not text.isprintable() or "://" in text, "isn't the name of a folder"),
-        (longest > COMPONENT or len(path.parts) > PARTS, "is too long for a path"),
+        (longest > 200 or len(path.parts) > 50, "is too long for a path"),
     ):
         if wrong:
             raise ConfigError(key, repr(text[:40]) if "~" not in text else text, why)

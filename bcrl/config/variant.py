@@ -12,17 +12,11 @@ from bcrl.common.identity import Plain
 from bcrl.config.schema import Choice
 from bcrl.envs import Env
 from bcrl.errors import ConfigError
+from bcrl.learning import transfer as handed
 from bcrl.learning.curriculum import CURRICULA
-from bcrl.learning.transfer import (
-    TRANSFERS,
-    Boost,
-    ResidualPolicy,
-    StageInit,
-    Transfer,
-    tried,
-    warm_start,
-)
 from bcrl.q.functions import ZERO
+
+ONE_TASK = "there is one task; env.tasks needs at least two values"
 
 
 @dataclass(frozen=True)
@@ -31,17 +25,17 @@ class Composition:
 
     tasks: tuple[Env, ...]  # easiest first, the target last
     order: tuple[int, ...]  # the task of each slot
-    boost: Boost | None = None
-    transfer: Transfer | None = None
+    boost: handed.Boost | None = None
+    transfer: handed.Transfer | None = None
     scale: Plain = field(default_factory=dict)
 
     @property
-    def transfers(self) -> tuple[Transfer, ...]:
+    def transfers(self) -> tuple[handed.Transfer, ...]:
         """What happens between two stages: a warm start unless something else does."""
-        return self._chosen or (warm_start,)
+        return self._chosen or (handed.warm_start,)
 
     @property
-    def _chosen(self) -> tuple[Transfer, ...]:
+    def _chosen(self) -> tuple[handed.Transfer, ...]:
         return tuple(t for t in (self.boost, self.transfer) if t is not None)
 
     @property
@@ -55,39 +49,37 @@ class Composition:
         return all(env == self.tasks[-1] for env in self.slots)
 
     @cached_property
-    def start(self) -> StageInit | None:
+    def start(self) -> handed.StageInit | None:
         """What a later stage starts from, as far as transfers tell without training."""
-        return tried(self.transfers)
+        return handed.tried(self.transfers)
 
     def check(self) -> None:
         """Raise ConfigError for choices that make no sense together."""
         boost, transfer, start = self.boost, self.transfer, self.start
         if len(self.order) == 1 and self._chosen:
             key = "boosting" if boost else "transfer"
-            raise ConfigError(key, boost or transfer, _one_task(self.tasks[-1]))
+            raise ConfigError(key, boost or transfer, ONE_TASK)
         if start is None:
             return
-        why, residual = "", isinstance(start.behavior, ResidualPolicy)
+        why, residual = "", isinstance(start.behavior, handed.ResidualPolicy)
         if start.behavior and self.target_only:
             why = "needs an earlier task whose policy helps: curriculum=on"
         elif residual and getattr(self.tasks[-1], "actions", None) is None:
             why = "combines actions as vectors, which env.action_vectors has to name"
         elif residual and start.base is not ZERO:
-            why = "learns the Q-values of its own actions, but a base has those of the "
-            why += "executed actions: boosting=off"
+            why = "learns Q of its own actions, a base of executed ones: boosting=off"
         if why:
             raise ConfigError("transfer", transfer, why)
         for key, one in (("transfer", transfer), ("boosting", boost)):
             rest = tuple(other for other in self._chosen if other is not one)
-            if one is not None and tried(rest) == start:
-                why = "has no effect: the next stage starts as it does without"
-                raise ConfigError(key, one, why)
+            if one is not None and handed.tried(rest) == start:
+                raise ConfigError(key, one, "has no effect: stages start as without it")
 
 
 def composition(config: Plain, tasks: list[Env]) -> Composition:
     """The groups' choices; ConfigError if they make no sense together."""
-    boost = _component("boosting", config["boosting"], {"on": Boost})
-    transfer = _component("transfer", config["transfer"], TRANSFERS)
+    boost = _component("boosting", config["boosting"], {"on": handed.Boost})
+    transfer = _component("transfer", config["transfer"], handed.TRANSFERS)
     order = order_of(config["curriculum"]["name"], tasks)
     made = Composition(tuple(tasks), order, boost, transfer, config["scale"])
     made.check()  # before budgets, which are lists with one entry per task
@@ -95,19 +87,16 @@ def composition(config: Plain, tasks: list[Env]) -> Composition:
 
 
 def order_of(curriculum: object, tasks: Sequence[Env]) -> tuple[int, ...]:
-    """The task of each slot: as many slots as tasks, the target among them.
+    """The task of each of n slots; ConfigError for an order without the target.
 
-    `curriculum` is one of CURRICULA, a trusted `module.function` or a function from the
-    number of tasks to their order. Raises ConfigError for an order that is none.
+    `curriculum` is one of CURRICULA, a trusted `module.function` or a function of n.
     """
     n = len(tasks)
     if n == 1 and curriculum != "off":
-        raise ConfigError("curriculum", curriculum, _one_task(tasks[-1]))
+        raise ConfigError("curriculum", curriculum, ONE_TASK)
     ordered: Any = curriculum
     if isinstance(curriculum, str) and "." in curriculum:
         ordered = plugins.attribute("curriculum.name", curriculum, curriculum)
-        if not callable(ordered):
-            raise ConfigError("curriculum.name", curriculum, "must be a function")
     elif not callable(curriculum):
         one_of("curriculum.name", curriculum, list(CURRICULA))
         ordered = CURRICULA[str(curriculum)]
@@ -115,22 +104,16 @@ def order_of(curriculum: object, tasks: Sequence[Env]) -> tuple[int, ...]:
         found, again = ordered(n), ordered(n)
         order = tuple(map(operator.index, found))
         whole = isinstance(found, list | tuple | range) and bool not in map(type, found)
-        fits = whole and len(order) == n and {n - 1} <= set(order) <= set(range(n))
+        fits = len(order) == n and {n - 1} <= set(order) <= set(range(n))
         same = list(found) == list(again)
     except Exception as error:  # whatever a function of the user's does
         why = f"failed for {n} tasks: {type(error).__name__}: {error}"
         raise ConfigError("curriculum", curriculum, why) from error
-    if not fits or not same:
-        why = f"visits {found!r:.80}" + f", then {again!r:.80}" * (not same)
-        why += f", but must always return one list of {n} integers from 0 to {n - 1}, "
-        why += f"one per slot, with the target, {n - 1}, among them"
+    if not (whole and fits and same):
+        why = f"visits {found!r:.80}, but must always return the same list of {n} "
+        why += f"integers from 0 to {n - 1}, with the target, {n - 1}, among them"
         raise ConfigError("curriculum", curriculum, why)
     return order
-
-
-def _one_task(env: Env) -> str:
-    why = f"{env.name} has one task, so there is no stage to hand over"
-    return f"{why}; env.tasks needs at least two values"
 
 
 def _component(group: str, section: Plain, classes: Mapping[str, type]) -> Any:

@@ -6,7 +6,7 @@ from omegaconf import OmegaConf
 
 from bcrl.common.identity import flat
 from bcrl.config import describe
-from bcrl.config.hydra_compose import CONF, composed, options
+from bcrl.config.hydra_compose import CONF, catalog, composed
 from bcrl.errors import BcrlError
 
 ENTRIES = describe.entries()
@@ -22,20 +22,15 @@ def check_keys(*compositions: tuple[str, ...]) -> None:
         assert {key for key in found if not key.startswith("hydra.")} <= known
 
 
-@pytest.mark.parametrize("env", options("env"))
+@pytest.mark.parametrize("env", catalog()["env"])
 def test_every_key_of_every_composition_is_described(env):
     named = ("env.id=CartPole-v1",) if env == "gymnasium" else ()
     check_keys(*((f"env={env}", f"algorithm={a}", *named) for a in ("fqi", "dqn")))
 
 
 def test_every_key_of_the_other_groups_is_described():
-    check_keys(
-        *(
-            ("env=maze", f"{group}={option}")
-            for group in ("algorithm/regressor", "boosting", "transfer")
-            for option in options(group)
-        )
-    )
+    for group in ("algorithm/regressor", "boosting", "transfer"):
+        check_keys(*(("env=maze", f"{group}={each}") for each in catalog()[group]))
     slurm = yaml.safe_load((CONF / "hydra" / "launcher" / "slurm.yaml").read_text())
     launcher = {f"hydra.launcher.{key}" for key in slurm if key != "_target_"}
     assert launcher <= {entry.key for entry in ENTRIES}
@@ -49,18 +44,10 @@ def test_comments_have_all_their_parts():
         assert allowed or entry.key.rpartition(".")[2] in FREE_TEXT.split(), entry
 
 
-@pytest.mark.parametrize(
-    ("key", "default", "unit", "allowed"),
-    [
-        ("env.tasks.mass", "[0.8, 1.0, 1.2]", "kg", "> 0"),
-        ("algorithm.batch_size", "32", "transitions", "≥ 1"),
-        ("checkpoint_every", "60", "seconds", "> 0"),
-    ],
-)
-def test_a_description_has_default_unit_and_allowed_values(key, default, unit, allowed):
-    lines = [line.strip() for line in describe.describe(key).splitlines()]
-    for line in (key, f"Default: {default}.", f"Unit: {unit}.", f"Allowed: {allowed}."):
-        assert line in lines
+def test_a_description_has_default_unit_and_allowed_values():
+    lines = [line.strip() for line in describe.describe("env.tasks.mass").splitlines()]
+    said = ["Default: [0.8, 1.0, 1.2].", "Unit: kg.", "Allowed: > 0."]
+    assert lines[0] == "env.tasks.mass" and lines[-3:] == said
 
 
 def test_defaults_differ_between_options_and_environments():
@@ -81,8 +68,6 @@ def test_a_word_is_a_key_a_group_a_section_or_a_typo(bcrl):
     assert "boosting=released: " in describe.describe("boosting")
     assert "seeds.count: " in describe.describe("seeds")
     assert len(describe.describe("").splitlines()) == len({e.key for e in ENTRIES})
-    for typed, meant in (("env.gama", "env.gamma"), ("lr", "algorithm.learning_rate")):
+    for typed, meant in (("env.gama", r"env\.gamma"), ("xyzzy", "lists all keys")):
         with pytest.raises(BcrlError, match=f"{typed}.*{meant}"):
             describe.describe(typed)
-    with pytest.raises(BcrlError, match=r"xyzzy.*lists all keys"):
-        describe.describe("xyzzy")

@@ -7,8 +7,9 @@ from types import ModuleType
 from typing import Any
 
 from bcrl.common import plugins
+from bcrl.common.checks import one_of
 from bcrl.common.identity import Plain
-from bcrl.errors import ConfigError, did_you_mean
+from bcrl.errors import ConfigError
 
 
 def algorithm(name: str) -> ModuleType:
@@ -19,12 +20,11 @@ def algorithm(name: str) -> ModuleType:
     ConfigError for an unknown name.
     """
     names = [module.name for module in pkgutil.iter_modules(__path__)]
-    if isinstance(name, str) and plugins.is_foreign(name, names):
+    if plugins.is_foreign(name, names):
         for needed in ("FAMILY", "LOCKSTEP", "stages"):
             plugins.attribute("algorithm.name", name, f"{name}.{needed}")
         return plugins.module("algorithm.name", name, name)
-    if name not in names:
-        raise ConfigError("algorithm.name", name, did_you_mean(str(name), names))
+    one_of("algorithm.name", name, names)
     return importlib.import_module(f"{__name__}.{name}")
 
 

@@ -3,7 +3,7 @@
 from bcrl.common.checks import construct, one_of
 from bcrl.common.identity import Plain
 from bcrl.config.algorithms import per_slot
-from bcrl.config.rules import capped, check_lspi, course
+from bcrl.config.rules import check_lspi, course
 from bcrl.config.variant import Composition
 from bcrl.errors import ConfigError
 from bcrl.learning.dqn import DQN
@@ -38,4 +38,4 @@ def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
             learners.append(construct("algorithm.lspi", LSPI, pretraining | shared))
         else:
             learners.append(dqn)
-    return capped(course(chosen, learners), DQN, steps=chosen.scale["max_steps"])
+    return course(chosen, learners)

@@ -6,7 +6,7 @@ from typing import Literal
 from bcrl.common.checks import construct
 from bcrl.common.identity import Plain
 from bcrl.config.algorithms import per_slot
-from bcrl.config.rules import capped, course
+from bcrl.config.rules import course
 from bcrl.config.variant import Composition
 from bcrl.learning.fqi import FQI
 from bcrl.learning.stage import Stage
@@ -32,7 +32,7 @@ class _Settings:
 
 
 def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
-    """One stage per slot, with the scale's caps on its budget."""
+    """One stage per slot."""
     learners = []
     for values in per_slot(section, _PER_SLOT, len(chosen.order)):
         own: _Settings = construct("algorithm", _Settings, values)
@@ -49,5 +49,4 @@ def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
                 fixed_trees=own.fit_randomness == "fixed",
             )
         )
-    caps = {key: chosen.scale[f"max_{key}"] for key in ("iterations", "episodes")}
-    return capped(course(chosen, learners), FQI, **caps)
+    return course(chosen, learners)
