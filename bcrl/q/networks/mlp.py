@@ -1,20 +1,21 @@
 """Q-networks of S seeds side by side: stacked weights, batched products and Adam.
 
-This module runs on any device. On a CPU, the module `cpu` computes the same faster, in
-compiled code; `DeepQ` and the DQN update choose by the device of the parameters.
+It runs on any device. On a CPU, the module `cpu` computes the same faster, in compiled
+code; `DeepQ` and the DQN update choose by the device of the parameters.
 """
 
+import copy
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from bcrl.common.serialization import DERIVED, storable
-from bcrl.q.functions import Values, check_width, each
+from bcrl.q.functions import Values, check_width
 from bcrl.q.networks import cpu
 
 Tensor = torch.Tensor
@@ -60,10 +61,6 @@ class Networks:
             weights = self.flat[:, at:end].view(-1, n_in, n_out)
             self.layers.append((weights, self.flat[:, None, end : end + n_out]))
             at = end + n_out
-
-    def clone(self) -> "Networks":
-        """Networks with copies of the parameters."""
-        return Networks(self.sizes, self.flat.clone())
 
     def forward(self, x: Tensor) -> Tensor:
         """Outputs (S, n, out), in a buffer that the next call with n overwrites."""
@@ -113,10 +110,6 @@ class Adam:
         """For parameters (S, P) that have not been trained."""
         return cls(parameters.new_zeros((2, *parameters.shape)), rate)
 
-    def clone(self) -> "Adam":
-        """The same step count and copies of the moments."""
-        return replace(self, moments=self.moments.clone())
-
     def next_step(self) -> tuple[float, float, float, float, float]:
         """Count a step; returns β1, β2, bias-corrected rate and scale, and ε."""
         self.steps += 1
@@ -150,9 +143,9 @@ class DeepQ:
         check_width(states, self.online.sizes[0])
         if isinstance(states, np.ndarray):
             return self._values(self.online, states)
-        sizes, rows = self.online.sizes, self.online.flat.split(1)
-        one = [Networks(sizes, row) for row in rows]
-        return each(states, lambda s: self._values(one[s], states[s][None])[0])
+        one = [Networks(self.online.sizes, row) for row in self.online.flat.split(1)]
+        pairs = zip(one, states, strict=True)
+        return [self._values(own, x[None])[0] for own, x in pairs]
 
     def _values(self, networks: Networks, x: NDArray) -> NDArray[np.float64]:
         """Values (S, n, A) at states x (S, n, d)."""
@@ -165,8 +158,7 @@ class DeepQ:
 
     def clone(self) -> "DeepQ":
         """A copy that may be trained on without changing this one."""
-        online, target = self.online.clone(), self.target.clone()
-        return DeepQ(online, target, self.optimiser.clone(), self.steps)
+        return copy.deepcopy(self)
 
     def copy_target(self) -> None:
         """The target becomes the online network."""
