@@ -50,10 +50,7 @@ def rows_of(env: FiniteEnv, state: NDArray[np.float64]) -> NDArray[np.intp]:
 def query(
     q: Q, states: Sequence[NDArray[np.float64]], n_actions: int
 ) -> tuple[list[NDArray[np.float64]], dict[int, str]]:
-    """Values (n_s, A) of S seeds, and why seeds failed, by their index in `states`.
-
-    A seed whose Q can't be evaluated gets zeros and changes no other seed's values.
-    """
+    """Values (n_s, A) of S seeds, and why some failed (zeros), by their index."""
     failed: dict[int, str] = {}
     while True:
         queried = [x[:0] if s in failed else x for s, x in enumerate(states)]
@@ -99,10 +96,7 @@ class Sum:
 @storable
 @dataclass(frozen=True)
 class Shaped:
-    """base + ϱ + max_a' potential(s, a'), which undoes the shaping of the rewards.
-
-    If the base is also the potential, it is evaluated once.
-    """
+    """base + ϱ + max_a' potential(s, a'), which undoes the shaping of the rewards."""
 
     base: Q
     residual: Q

@@ -36,10 +36,8 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
     max_depth : levels of splits that a tree may have; None is no limit.
     min_samples_split : fewest rows, weights counted, of a node that is split.
     min_samples_leaf : fewest rows, weights counted, on either side of a split.
-    max_features : features tried per split: so many, a share in (0, 1], "sqrt", "log2"
-        or None for all.
-    random_state : where the trees' seeds come from; an integer gives the same trees at
-        every fit.
+    max_features : features tried per split, or their share, "sqrt", "log2", None (all).
+    random_state : source of the trees' seeds; an integer gives each fit the same trees.
     n_jobs : threads; None is 1, −1 is one per core. Never changes a result.
 
     Attributes

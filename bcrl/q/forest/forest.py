@@ -2,13 +2,9 @@
 
 Geurts, Ernst and Wehenkel, "Extremely randomized trees", Machine Learning 63 (2006):
 each tree sees all rows; in a node one threshold is drawn per tried feature, uniformly
-between the feature's extremes, and the one that reduces the variance most is kept. A
-forest predicts the mean of its trees' leaf means.
-
-Beyond scikit-learn: rows can have multiplicities, which count in everything as that
-many equal rows would; the training rows and given query rows are predicted while the
-trees grow; many forests are fitted in one call, on threads that cannot change a result.
-
+between the feature's extremes, and the one that reduces the variance most is kept.
+Beyond scikit-learn: a row of multiplicity k counts as k equal rows; rows and queries
+are predicted while the trees grow; many forests are fitted in one call, on threads.
 Targets are rounded to multiples of about max|y| · rows · 2^−62; sums are then exact.
 """
 
@@ -42,18 +38,13 @@ class TreeSettings:
 
 @dataclass
 class Regression:
-    """One forest's problem; BcrlError for data that no forest can be fitted to.
+    """One forest's problem; BcrlError for data that no forest can be fitted to."""
 
-    x: (n, d) float32; y: (n,) float64; tree_seeds: (T,) uint64, one per tree;
-    multiplicity: (n,) int64, at least 1, or None for 1 everywhere; queries: (m, d)
-    float32 or None. All values finite.
-    """
-
-    x: np.ndarray
-    y: np.ndarray
-    tree_seeds: np.ndarray
-    multiplicity: np.ndarray | None = None
-    queries: np.ndarray | None = None
+    x: np.ndarray  # (n, d) float32, finite, as all values
+    y: np.ndarray  # (n,) float64
+    tree_seeds: np.ndarray  # (T,) uint64, one per tree
+    multiplicity: np.ndarray | None = None  # (n,) int64 from 1 on; None: all are 1
+    queries: np.ndarray | None = None  # (m, d) float32
 
     def __post_init__(self) -> None:
         x = self.x = _points("x", self.x)
@@ -77,22 +68,13 @@ class Regression:
 
 @dataclass(frozen=True)
 class Forest:
-    """The trees of a forest, packed one after the other: 16 bytes per node.
+    """The trees of a forest, packed one after the other: 16 bytes per node."""
 
-    nodes: (N,) of `split.NODE`; values: (leaves,) float64; first: (T+1,) int64,
-    where each tree begins; depths: (T,) int64, 0 for a tree that is a single leaf.
-    """
-
-    nodes: np.ndarray
-    values: np.ndarray
-    first: np.ndarray
-    depths: np.ndarray
+    nodes: np.ndarray  # (N,) of `split.NODE`
+    values: np.ndarray  # (leaves,) float64
+    first: np.ndarray  # (T+1,) int64, where each tree begins
+    depths: np.ndarray  # (T,) int64, 0 for a tree that is a single leaf
     n_features: int
-
-    @property
-    def node_counts(self) -> np.ndarray:
-        """Nodes of each tree, leaves included: (T,) int64."""
-        return np.diff(self.first)
 
     def predict(self, x: np.ndarray) -> np.ndarray:
         """Mean of the trees at `x`, (n, d) taken as float32: (n,) float64."""

@@ -103,10 +103,7 @@ def _adam(parameters, first, second, gradient, adam):
 
 @_compiled
 def step_of_adam(parameters, first, second, gradient, adam):
-    """Adam's step (Kingma and Ba 2015, algorithm 1) on arrays (P,), in place.
-
-    The last floats are rounded like the others: they go through the same vectors.
-    """
+    """Adam's step (Kingma and Ba 2015) on arrays (P,); all floats are rounded alike."""
     n, whole = len(parameters), len(parameters) // _BLOCK * _BLOCK
     _adam(parameters[:whole], first[:whole], second[:whole], gradient, adam)
     if whole < n:
@@ -134,8 +131,7 @@ def _mask_and_turn(slopes, units, n_units, n, turned):
 def backward(flat, first, second, sizes, room, n, adam):
     """A step of Adam on one seed's network (P,), after `forward` at n inputs.
 
-    first, second (P,): moments; adam: from `Adam.next_step`; room.turned holds
-    ∂loss/∂output, and so does the last of room.slopes.
+    room.turned holds ∂loss/∂output, and so does the last of room.slopes.
     """
     at, last = len(flat), len(sizes) - 2
     above, n_above = room.all, sizes[last + 1]
@@ -199,10 +195,7 @@ def outputs(flat, sizes, x):
 
 @_compiled
 def renew(target, sizes, rows, bootstrap, valid, indices, layout, stale, room):
-    """Make a seed's `bootstrap` max_a' (ϱ + base)(s') in `Replay` valid at `indices`.
-
-    The target is evaluated at up to n rows at a time: stale (n,) is overwritten.
-    """
+    """Make max_a' (ϱ + base)(s') valid at `indices`, up to len(stale) at a time."""
     d, n_actions = layout
     n, last = 0, len(indices) - 1
     for i, place in enumerate(indices):
@@ -225,10 +218,7 @@ def renew(target, sizes, rows, bootstrap, valid, indices, layout, stale, room):
 
 @_entry_point
 def renew_ahead(target, sizes, replay, held, indices, layout):
-    """`renew` for S seeds at `indices` (T, S, B) of batches to come: in larger passes.
-
-    Rows that are not among the first `held` ones yet are left out.
-    """
+    """`renew` for S seeds at all `indices` (T, S, B) below `held`: in larger passes."""
     rows, bootstrap, valid = replay
     room, stale = space(sizes, _AHEAD), np.empty(_AHEAD, np.int64)
     for s in range(len(target)):

@@ -29,11 +29,9 @@ def xavier(
     Weights (in, out) are Xavier-uniform with `gain` (1 in the last layer), biases
     uniform on ±1/√in (Glorot and Bengio 2010; torch's default for biases).
     """
-    parts = []
-    pairs = list(itertools.pairwise(sizes))
-    for layer, (n_in, n_out) in enumerate(pairs):
-        scale = gain if layer < len(pairs) - 1 else 1.0
-        limit = scale * math.sqrt(6.0 / (n_in + n_out))
+    parts, last = [], len(sizes) - 2
+    for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
+        limit = (gain if layer < last else 1.0) * math.sqrt(6.0 / (n_in + n_out))
         parts.append(rng.uniform(-limit, limit, n_in * n_out))
         parts.append(rng.uniform(-1.0, 1.0, n_out) / math.sqrt(n_in))
     return np.concatenate(parts).astype(np.float32)
@@ -42,14 +40,10 @@ def xavier(
 @storable
 @dataclass(eq=False)
 class Networks:
-    """S perceptrons with ReLUs, one per seed; no seed's result depends on the others.
+    """S perceptrons with ReLUs, one per seed; none depends on the others."""
 
-    sizes: the layers' widths (in, hidden …, out); flat: all parameters, (S, P). Inputs
-    have shape (S, n, in).
-    """
-
-    sizes: tuple[int, ...]
-    flat: Tensor
+    sizes: tuple[int, ...]  # the layers' widths (in, hidden …, out)
+    flat: Tensor  # all parameters, (S, P)
     _buffers: dict[int, list[Tensor]] = field(
         default_factory=dict, repr=False, metadata=DERIVED
     )
@@ -63,11 +57,10 @@ class Networks:
             at = end + n_out
 
     def forward(self, x: Tensor) -> Tensor:
-        """Outputs (S, n, out), in a buffer that the next call with n overwrites."""
+        """Outputs (S, n, out) at x (S, n, in); the next call with n overwrites them."""
         n = x.shape[1]
         if n not in self._buffers:
-            widths = self.sizes[1:]
-            self._buffers[n] = [x.new_empty((x.shape[0], n, w)) for w in widths]
+            self._buffers[n] = [x.new_empty((len(x), n, w)) for w in self.sizes[1:]]
         for layer, (weights, biases) in enumerate(self.layers):
             x = x.relu_() if layer else x
             x = torch.baddbmm(biases, x, weights, out=self._buffers[n][layer])

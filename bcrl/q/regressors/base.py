@@ -143,7 +143,12 @@ class FittedQ:
     team: Any  # its `threads` may be used
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        self._restore()  # what a checkpoint has left out
+        lost = [f for row in self.models for f in row if f and f.model is None]
+        if lost:  # what a checkpoint has left out is fitted again
+            problems = [deepcopy(fitted.problem) for fitted in lost]
+            fits = self.regressor.fit(problems, True, self.team.threads)
+            for fitted, fit in zip(lost, fits, strict=True):
+                fitted.model = fit.model
         models = {
             (s, a): fitted.model
             for s, row in enumerate(self.models)
@@ -166,11 +171,3 @@ class FittedQ:
         for (s, a), values in found.items():
             out[s][:, a] = values
         return np.stack(out) if isinstance(states, np.ndarray) else out
-
-    def _restore(self) -> None:
-        lost = [f for row in self.models for f in row if f and f.model is None]
-        if lost:
-            problems = [deepcopy(fitted.problem) for fitted in lost]
-            fits = self.regressor.fit(problems, True, self.team.threads)
-            for fitted, fit in zip(lost, fits, strict=True):
-                fitted.model = fit.model
