@@ -104,7 +104,7 @@ class Shaped:
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         base, own = self.base(states, n_actions), self.residual(states, n_actions)
-        same = self.potential is self.base
+        same = self.potential is self.base  # queried once: it may be stacked itself
         v = base if same else self.potential(states, n_actions)
         return each(states, lambda s: base[s] + own[s] + v[s].max(-1, keepdims=True))
 

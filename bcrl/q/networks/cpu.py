@@ -103,10 +103,10 @@ def _adam(parameters, first, second, gradient, adam):
 
 @_compiled
 def step_of_adam(parameters, first, second, gradient, adam):
-    """Adam's step (Kingma and Ba 2015) on arrays (P,); all floats are rounded alike."""
+    """Adam's step (Kingma and Ba 2015, algorithm 1) on arrays (P,), in place."""
     n, whole = len(parameters), len(parameters) // _BLOCK * _BLOCK
     _adam(parameters[:whole], first[:whole], second[:whole], gradient, adam)
-    if whole < n:
+    if whole < n:  # the last floats are rounded like the others, by the same vectors
         rest = np.zeros((4, _BLOCK), np.float32)
         arrays = parameters, first, second, gradient
         for i in range(4):

@@ -53,7 +53,7 @@ class Sklearn(_Fitting):
     """Any regressor of scikit-learn, by the name of its class and its arguments.
 
     From Python, `estimator` may also be an estimator or a pipeline. `standardise` puts
-    a StandardScaler before it. Each `random_state` gets a new value per fit.
+    a StandardScaler before it. Each fit has its own `random_state`. Raises ConfigError.
     """
 
     estimator: Any
