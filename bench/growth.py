@@ -69,7 +69,7 @@ def by_turns(runs: list[Iterator[Iteration]]) -> list[tuple[float, float]]:
             now = next(run)
             took = (time.process_time() - began) * 1e3
             forests = [f for models in now.result.residual.models for f in models]
-            best[i] = min(best[i], (took, np.mean([f.node_counts for f in forests])))
+            best[i] = min(best[i], (took, np.mean([np.diff(f.first) for f in forests])))
     return best
 
 

@@ -133,7 +133,8 @@ class DQNTrainer:
             drawn = [xavier(stream(s, "weights", number), sizes) for s in seeds]
             online = Networks(sizes, torch.from_numpy(np.stack(drawn)).to(device))
             adam = Adam.of(online.flat, settings.learning_rate)
-            deep = DeepQ(online, online.clone(), adam)
+            target = Networks(online.sizes, online.flat.clone())
+            deep = DeepQ(online, target, adam)
         shape = (n, settings.replay_size, env.state_dim, env.n_actions)
         replay, (steps, decisions) = Replay.empty(*shape, device), np.zeros((2, n), int)
         return DQNState(deep, replay, lanes, env_state, steps, decisions, np.zeros(n))

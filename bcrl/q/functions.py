@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Protocol
 
 import numpy as np
@@ -16,11 +17,7 @@ NOT_FINITE = "Q is not finite"  # why a seed failed
 
 
 class Q(Protocol):
-    """Q-functions of S seeds; each seed has its own states.
-
-    The S arrays of states may be one stacked array (S, n, d); then the values are
-    stacked, too.
-    """
+    """Q-functions of S seeds; of states stacked in one array, the values are, too."""
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         """Action values, S arrays (n_s, A), at S arrays of states (n_s, d)."""
@@ -34,12 +31,11 @@ def each(states: Sequence[NDArray], values: Callable[[int], NDArray]) -> Values:
 
 def check_width(states: Sequence[NDArray], d: int) -> None:
     """Raise BcrlError unless all states have `d` entries, as compiled code needs."""
-    stacked = isinstance(states, np.ndarray)
-    for width in {x.shape[-1] for x in (states[:1] if stacked else states)}:
-        if width != d:
+    for x in states[:1] if isinstance(states, np.ndarray) else states:
+        if x.shape[-1] != d:
             raise BcrlError(
                 f"a Q-function of states with {d} entries can't be evaluated at states "
-                f"with {width}; pass a simulator's observations, not what resets it"
+                f"with {x.shape[-1]}; pass a simulator's observations"
             )
 
 
@@ -54,10 +50,7 @@ def rows_of(env: FiniteEnv, state: NDArray[np.float64]) -> NDArray[np.intp]:
 def query(
     q: Q, states: Sequence[NDArray[np.float64]], n_actions: int
 ) -> tuple[list[NDArray[np.float64]], dict[int, str]]:
-    """Values (n_s, A) of S seeds, and why seeds failed, by their index in `states`.
-
-    A seed whose Q can't be evaluated gets zeros and changes no other seed's values.
-    """
+    """Values (n_s, A) of S seeds, and why some failed (zeros), by their index."""
     failed: dict[int, str] = {}
     while True:
         queried = [x[:0] if s in failed else x for s, x in enumerate(states)]
@@ -80,9 +73,7 @@ class Zero:
     """Q = 0, what an approximator predicts before its first fit."""
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        if isinstance(states, np.ndarray):
-            return np.zeros((*states.shape[:-1], n_actions))
-        return [np.zeros((len(x), n_actions)) for x in states]
+        return each(states, lambda s: np.zeros((len(states[s]), n_actions)))
 
 
 ZERO = Zero()
@@ -96,23 +87,16 @@ class Sum:
     terms: tuple[Q, ...]
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        total, *rest = (term(states, n_actions) for term in self.terms)
-        for values in rest:
-            if isinstance(states, np.ndarray):
-                total = total + values
-            else:
-                total = [a + b for a, b in zip(total, values, strict=True)]
-        return total
+        values = [term(states, n_actions) for term in self.terms]
+        if isinstance(states, np.ndarray):
+            return reduce(np.add, values)
+        return [reduce(np.add, own) for own in zip(*values, strict=True)]
 
 
 @storable
 @dataclass(frozen=True)
 class Shaped:
-    """base + ϱ + max_a' potential(s, a'), which undoes the shaping of the rewards.
-
-    If the base is also the potential, it is evaluated once, because stages may be
-    stacked on stages.
-    """
+    """base + ϱ + max_a' potential(s, a'), which undoes the shaping of the rewards."""
 
     base: Q
     residual: Q
@@ -120,7 +104,7 @@ class Shaped:
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         base, own = self.base(states, n_actions), self.residual(states, n_actions)
-        same = self.potential is self.base
+        same = self.potential is self.base  # queried once: it may be stacked itself
         v = base if same else self.potential(states, n_actions)
         return each(states, lambda s: base[s] + own[s] + v[s].max(-1, keepdims=True))
 
@@ -134,10 +118,7 @@ def add(base: Q, residual: Q) -> Q:
 
 
 class MemoizedQ:
-    """A frozen Q that is evaluated once at each state.
-
-    The greedy episodes of an iteration visit mostly states of earlier iterations.
-    """
+    """A frozen Q that is evaluated once at each state; most states come again."""
 
     def __init__(self, q: Q) -> None:
         self.q = q
@@ -146,17 +127,14 @@ class MemoizedQ:
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         keys = [[(s, state.tobytes()) for state in x] for s, x in enumerate(states)]
         cached = self._values
-        new = [[i for i, key in enumerate(row) if key not in cached] for row in keys]
+        new = [[i for i, key in enumerate(own) if key not in cached] for own in keys]
         if any(new):
             queried = [x[rows] for x, rows in zip(states, new, strict=True)]
             values = self.q(queried, n_actions)
-            for row, rows, found in zip(keys, new, values, strict=True):
-                cached.update(zip((row[i] for i in rows), found, strict=True))
-
-        def values_of(s: int) -> NDArray[np.float64]:
-            return np.array([cached[key] for key in keys[s]]).reshape(-1, n_actions)
-
-        return each(states, values_of)
+            for own, rows, fresh in zip(keys, new, values, strict=True):
+                cached.update(zip((own[i] for i in rows), fresh, strict=True))
+        found = [np.array([cached[key] for key in own]) for own in keys]
+        return each(states, lambda s: found[s].reshape(-1, n_actions))
 
 
 def memoized(q: Q) -> Q:

@@ -195,13 +195,10 @@ def test_weights_and_biases_fill_their_boxes(hidden):
     sizes = (D, *hidden, A)
     drawn = np.stack([xavier(stream(s, "weights", 1), sizes) for s in range(40)])
     at = 0
-    for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
-        gain = 1.0 if layer == len(hidden) else math.sqrt(2.0)
-        boxes = (
-            (n_in * n_out, gain * math.sqrt(6.0 / (n_in + n_out))),
-            (n_out, 1.0 / math.sqrt(n_in)),
-        )
-        for n, bound in boxes:
+    for n_in, n_out in itertools.pairwise(sizes):
+        gain = 1.0 if n_out == A else math.sqrt(2.0)
+        weights = n_in * n_out, gain * math.sqrt(6.0 / (n_in + n_out))
+        for n, bound in (weights, (n_out, 1.0 / math.sqrt(n_in))):
             part, at = drawn[:, at : at + n], at + n
             assert 0.97 * bound < np.abs(part).max() <= bound * (1.0 + 1e-6)
             assert part.std() == pytest.approx(bound / math.sqrt(3.0), rel=0.1)

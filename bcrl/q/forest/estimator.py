@@ -15,15 +15,16 @@ from sklearn.utils._param_validation import Interval
 from bcrl.q.forest import forest
 
 _theirs = ExtraTreesRegressor._parameter_constraints
+_COUNT = [Interval(Integral, 1, None, closed="left")]
 
 
 class ExtraTrees(RegressorMixin, BaseEstimator):
     """Extra-trees regression, `bcrl.q.forest` behind scikit-learn's interface.
 
-    It has the parameters below of `sklearn.ensemble.ExtraTreesRegressor`, with the same
-    meaning and the same defaults (max_features=None is scikit-learn's 1.0). Its trees
-    differ, but have the same distribution. Weights must be whole numbers: a row of
-    weight 3 gives exactly the trees of three equal rows. Not supported: several
+    The parameters have the meaning and defaults that they have in
+    `sklearn.ensemble.ExtraTreesRegressor` (max_features=None is its 1.0). Trees differ
+    from its trees, but have the same distribution. Weights must be whole numbers: a row
+    of weight 3 gives exactly the trees of three equal rows. Not supported: several
     outputs, missing values, sparse X, fractional `min_samples_*`, other criteria than
     the squared error, `max_leaf_nodes`, `min_impurity_decrease`, `ccp_alpha`,
     `min_weight_fraction_leaf`, `monotonic_cst`, `bootstrap`, `oob_score`,
@@ -35,10 +36,8 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
     max_depth : levels of splits that a tree may have; None is no limit.
     min_samples_split : fewest rows, weights counted, of a node that is split.
     min_samples_leaf : fewest rows, weights counted, on either side of a split.
-    max_features : features tried per split: so many, a share in (0, 1], "sqrt", "log2"
-        or None for all.
-    random_state : where the trees' seeds come from; an integer gives the same trees at
-        every fit.
+    max_features : features tried per split, or their share, "sqrt", "log2", None (all).
+    random_state : source of the trees' seeds; an integer gives each fit the same trees.
     n_jobs : threads; None is 1, −1 is one per core. Never changes a result.
 
     Attributes
@@ -49,17 +48,13 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
     """
 
     _parameter_constraints: ClassVar[dict[str, list]] = {
-        **{
-            name: _theirs[name]
-            for name in ("n_estimators", "max_depth", "max_features", "random_state")
-        },
+        "max_depth": _theirs["max_depth"],
+        "max_features": _theirs["max_features"],
+        "random_state": _theirs["random_state"],
+        "n_estimators": _COUNT,
         "min_samples_split": _theirs["min_samples_split"][:1],  # no shares of the rows
-        "min_samples_leaf": _theirs["min_samples_leaf"][:1],
-        "n_jobs": [
-            Interval(Integral, 1, None, closed="left"),
-            Interval(Integral, None, -1, closed="right"),
-            None,
-        ],
+        "min_samples_leaf": _COUNT,
+        "n_jobs": [*_COUNT, Interval(Integral, None, -1, closed="right"), None],
     }
     forest_: forest.Forest
 
@@ -109,15 +104,15 @@ class ExtraTrees(RegressorMixin, BaseEstimator):
         counts = _counts(x, sample_weight if multiplicity is None else multiplicity)
         used = counts > 0
         x, counts, target = x[used], counts[used], np.asarray(y, np.float64)[used]
-        random, trees = check_random_state(self.random_state), self.n_estimators
-        seeds = random.randint(0, 2**64, size=trees, dtype=np.uint64)
+        random = check_random_state(self.random_state)
+        seeds = random.randint(0, 2**64, size=self.n_estimators, dtype=np.uint64)
         most: Any = self.max_features
         if isinstance(most, str):
             most = max(1, int(getattr(math, most)(x.shape[1])))
         elif most is not None and not isinstance(most, Integral):
             most = max(1, int(most * x.shape[1]))
         limits = self.min_samples_split, self.min_samples_leaf, most, self.max_depth
-        parts = np.array_split(seeds, min(threads, trees))
+        parts = np.array_split(seeds, min(threads, len(seeds)))
         tasks = [forest.Regression(x, target, part, counts) for part in parts]
         fits = forest.fit_forests(tasks, forest.TreeSettings(*limits), threads=threads)
         self.forest_ = forest.join([fit.forest for fit in fits if fit.forest])

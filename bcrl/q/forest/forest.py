@@ -2,13 +2,9 @@
 
 Geurts, Ernst and Wehenkel, "Extremely randomized trees", Machine Learning 63 (2006):
 each tree sees all rows; in a node one threshold is drawn per tried feature, uniformly
-between the feature's extremes, and the one that reduces the variance most is kept. A
-forest predicts the mean of its trees' leaf means.
-
-Beyond scikit-learn: rows can have multiplicities, which count in everything as that
-many equal rows would; the training rows and given query rows are predicted while the
-trees grow; many forests are fitted in one call, on threads that cannot change a result.
-
+between the feature's extremes, and the one that reduces the variance most is kept.
+Beyond scikit-learn: a row of multiplicity k counts as k equal rows; rows and queries
+are predicted while the trees grow; many forests are fitted in one call, on threads.
 Targets are rounded to multiples of about max|y| · rows · 2^−62; sums are then exact.
 """
 
@@ -42,38 +38,43 @@ class TreeSettings:
 
 @dataclass
 class Regression:
-    """One forest's problem.
+    """One forest's problem; BcrlError for data that no forest can be fitted to."""
 
-    x: (n, d) float32; y: (n,) float64; tree_seeds: (T,) uint64, one per tree;
-    multiplicity: (n,) int64, at least 1, or None for 1 everywhere; queries: (m, d)
-    float32 or None. All values finite.
-    """
+    x: np.ndarray  # (n, d) float32, finite, as all values
+    y: np.ndarray  # (n,) float64
+    tree_seeds: np.ndarray  # (T,) uint64, one per tree
+    multiplicity: np.ndarray | None = None  # (n,) int64 from 1 on; None: all are 1
+    queries: np.ndarray | None = None  # (m, d) float32
 
-    x: np.ndarray
-    y: np.ndarray
-    tree_seeds: np.ndarray
-    multiplicity: np.ndarray | None = None
-    queries: np.ndarray | None = None
+    def __post_init__(self) -> None:
+        x = self.x = _points("x", self.x)
+        y = self.y = np.ascontiguousarray(self.y, np.float64)
+        seeds = self.tree_seeds = np.ascontiguousarray(self.tree_seeds, np.uint64)
+        if len(x) < 1 or y.shape != (len(x),):
+            raise BcrlError(f"y has shape {y.shape}, expected ({max(len(x), 1)},)")
+        if not np.isfinite(y).all():
+            raise BcrlError("y holds NaN or infinity")
+        if seeds.ndim != 1 or len(seeds) < 1:
+            raise BcrlError(f"tree_seeds has shape {seeds.shape}, expected (trees,)")
+        given, self.multiplicity = self.multiplicity, np.empty(0, np.int64)
+        if given is not None:
+            counts = self.multiplicity = np.ascontiguousarray(given, np.int64)
+            if counts.shape != y.shape or counts.min() < 1 or counts.sum() >= 2**40:
+                why = "integers of at least 1, below 2^40 in all"
+                raise BcrlError(f"multiplicity must be ({len(x)},) {why}")
+        given = x[:0] if self.queries is None else self.queries
+        self.queries = _points("queries", given, x.shape[1])
 
 
 @dataclass(frozen=True)
 class Forest:
-    """The trees of a forest, packed one after the other: 16 bytes per node.
+    """The trees of a forest, packed one after the other: 16 bytes per node."""
 
-    nodes: (N,) of `split.NODE`; values: (leaves,) float64; first: (T+1,) int64,
-    where each tree begins; depths: (T,) int64, 0 for a tree that is a single leaf.
-    """
-
-    nodes: np.ndarray
-    values: np.ndarray
-    first: np.ndarray
-    depths: np.ndarray
+    nodes: np.ndarray  # (N,) of `split.NODE`
+    values: np.ndarray  # (leaves,) float64
+    first: np.ndarray  # (T+1,) int64, where each tree begins
+    depths: np.ndarray  # (T,) int64, 0 for a tree that is a single leaf
     n_features: int
-
-    @property
-    def node_counts(self) -> np.ndarray:
-        """Nodes of each tree, leaves included: (T,) int64."""
-        return np.diff(self.first)
 
     def predict(self, x: np.ndarray) -> np.ndarray:
         """Mean of the trees at `x`, (n, d) taken as float32: (n,) float64."""
@@ -83,39 +84,34 @@ class Forest:
 
 @dataclass
 class ForestFit:
-    """A fitted forest, and its predictions at the training rows and at the queries.
+    """A fitted forest, and what its `predict` gives at the rows and at the queries."""
 
-    fitted: (n,) float64; queried: (m,) float64; both what `forest.predict` gives, bit
-    for bit. forest: None if it was not kept.
-    """
-
-    forest: Forest | None
-    fitted: np.ndarray
-    queried: np.ndarray
+    forest: Forest | None  # if it was kept
+    fitted: np.ndarray  # (n,) float64
+    queried: np.ndarray  # (m,) float64
 
 
 def join(forests: Sequence[Forest]) -> Forest:
     """One forest of all the trees of `forests`, in order."""
     nodes = np.concatenate([forest.nodes for forest in forests])
-    first, trees, at, leaves = [np.zeros(1, np.int64)], [], 0, 0
+    first, at, leaves = [np.zeros(1, np.int64)], 0, 0
     for forest in forests:
         part = nodes[at : at + len(forest.nodes)]
         part["child"] += np.where(part["feature"] < 0, leaves, at).astype(np.int32)
         first.append(forest.first[1:] + at)
-        trees.append(forest.depths)
         at, leaves = at + len(part), leaves + len(forest.values)
     values = np.concatenate([forest.values for forest in forests])
-    starts, depths = np.concatenate(first), np.concatenate(trees)
-    return Forest(nodes, values, starts, depths, forests[0].n_features)
+    depths = np.concatenate([forest.depths for forest in forests])
+    return Forest(nodes, values, np.concatenate(first), depths, forests[0].n_features)
 
 
 def importances(
     forest: Forest, x: np.ndarray, y: np.ndarray, multiplicity: np.ndarray
 ) -> np.ndarray:
-    """Each feature's share (d,) of the variance that the splits remove, or zeros.
+    """The trees' mean shares (d,) of the variance that each feature's splits remove.
 
-    x (n, d) float32, y (n,), multiplicity (n,): what the forest was fitted to. The mean
-    of the trees' shares, as scikit-learn defines it (Breiman et al. 1984).
+    Zeros without splits, as in scikit-learn (Breiman et al. 1984). x (n, d) float32,
+    y (n,), multiplicity (n,): what the forest was fitted to.
     """
     bits = (x + np.float32(0.0)).view(np.int32)  # −0 is taken as +0
     keys = bits ^ ((bits >> 31) & np.int32(2**31 - 1))  # `split.key_of`
@@ -153,19 +149,17 @@ def fit_forests(
     """Fit one forest per regression; neither `threads` nor the others change it.
 
     keep: whether the trees are stored; predictions come with each result either way.
-    Raises BcrlError for data that no forest can be fitted to.
     """
-    limits = [2**62 if x is None else int(x) for x in astuple(settings)]
-    checked = [_checked(regression) for regression in regressions]
+    limits = tuple(2**62 if x is None else int(x) for x in astuple(settings))
 
-    def fit(arguments: tuple[np.ndarray, ...]) -> ForestFit:
-        grown = grow_forest(*arguments, tuple(limits), keep)
+    def fit(task: Regression) -> ForestFit:
+        data = task.x, task.y, task.multiplicity, task.tree_seeds, task.queries
+        grown = grow_forest(*data, limits, keep)
         nodes, values, first, depths, fitted, queried = grown
-        d = arguments[0].shape[1]
-        forest = Forest(nodes, values, first, depths, d) if keep else None
-        return ForestFit(forest, fitted, queried)
+        forest = Forest(nodes, values, first, depths, task.x.shape[1])
+        return ForestFit(forest if keep else None, fitted, queried)
 
-    return _spread(fit, checked, threads)
+    return _spread(fit, regressions, threads)
 
 
 def predict_forests(
@@ -180,9 +174,7 @@ def _spread(function: Callable, items: Sequence, threads: int) -> list:
     """The results of `function` for all items, on up to `threads` threads."""
     at_least("threads", threads, 1)
     threads = min(threads, len(items), 4 * (os.cpu_count() or 1))
-    if threads <= 1:
-        return [function(item) for item in items]
-    return list(_pool(threads).map(function, items))
+    return list((_pool(threads).map if threads > 1 else map)(function, items))
 
 
 @cache
@@ -195,30 +187,7 @@ def _points(name: str, x: np.ndarray, d: int | None = None) -> np.ndarray:
     """`x` as finite (n, d) float32 in C order, uncopied if it is that already."""
     x = np.ascontiguousarray(x, np.float32)
     if x.ndim != 2 or x.shape[1] < 1 or (d or x.shape[1]) != x.shape[1]:
-        expected = f"expected (rows, {d or 'features'})"
-        raise BcrlError(f"{name} has shape {x.shape}, {expected}")
+        raise BcrlError(f"{name} has shape {x.shape}, not (rows, {d or 'features'})")
     if not np.isfinite(x).all():
         raise BcrlError(f"{name} holds NaN, infinity or values too large for float32")
     return x
-
-
-def _checked(regression: Regression) -> tuple[np.ndarray, ...]:
-    """Checked x, y, multiplicity, tree seeds and queries for the compiled code."""
-    x = _points("x", regression.x)
-    y = np.ascontiguousarray(regression.y, np.float64)
-    seeds = np.ascontiguousarray(regression.tree_seeds, np.uint64)
-    if len(x) < 1 or y.shape != (len(x),):
-        raise BcrlError(f"y has shape {y.shape}, expected ({max(len(x), 1)},)")
-    if not np.isfinite(y).all():
-        raise BcrlError("y holds NaN or infinity")
-    if seeds.ndim != 1 or len(seeds) < 1:
-        raise BcrlError(f"tree_seeds has shape {seeds.shape}, expected one per tree")
-    counts, queries = np.empty(0, np.int64), x[:0]  # all rows count once
-    if regression.multiplicity is not None:
-        counts = np.ascontiguousarray(regression.multiplicity, np.int64)
-        if counts.shape != y.shape or counts.min() < 1 or counts.sum() >= 2**40:
-            why = f"must be ({len(x)},) integers of at least 1, below 2^40 in all"
-            raise BcrlError(f"multiplicity {why}")
-    if regression.queries is not None:
-        queries = _points("queries", regression.queries, x.shape[1])
-    return x, y, counts, seeds, queries

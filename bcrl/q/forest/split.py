@@ -3,8 +3,7 @@
 Features are **keys**, integers ordered like the float32 values they stand for, so that
 comparisons vectorise. Targets are **fixed-point** int64, so that sums are exact and do
 not depend on the order of rows or on the machine: a row of multiplicity 3 and three
-equal rows give the same tree bit for bit. A row's keys lie next to each other
-(`trees.Rows`). Indices are unsigned: numba checks whether signed ones are negative.
+equal rows give the same tree. Indices are unsigned: numba checks signed ones for < 0.
 """
 
 from collections.abc import Callable
@@ -18,11 +17,9 @@ from numba import njit
 #: `child + 1`; a leaf has feature −1 and its value at `child` in the leaf values.
 NODE = np.dtype([("cut", np.int32), ("feature", np.int32), ("child", np.int32)])
 
-#: Variance of the targets up to which a node is a leaf: float64's eps, in units of the
-#: target squared (scikit-learn's rule).
-PURE = float(np.finfo(np.float64).eps)
-#: Range up to which a feature counts as constant in a node (scikit-learn's rule).
-CONSTANT = np.float32(1e-7)
+#: Variance of the targets up to which a node is a leaf, and range up to which a feature
+#: counts as constant in a node: scikit-learn's.
+PURE, CONSTANT = float(np.finfo(np.float64).eps), np.float32(1e-7)
 
 U = np.uint64
 GOLDEN, LOW32 = U(0x9E3779B97F4A7C15), U(0xFFFFFFFF)
@@ -82,14 +79,13 @@ class Split(NamedTuple):
 
 
 @inlined
-def is_pure(target, weight, start, stop, total_weight, unit):
+def is_pure(rows, start, stop, total_weight, unit):
     """Whether the variance of the targets at `start:stop` is at most PURE.
 
     Two rows at a distance δ alone give a variance of at least δ² / (2 · total weight).
     """
-    first = target[start]
-    limit = 2.0 * total_weight * PURE
-    mean, square = 0.0, 0.0
+    target, weight, mean, square = rows.target, rows.weight, 0.0, 0.0
+    first, limit = target[start], 2.0 * total_weight * PURE
     for i in range(start + U(1), stop):
         far = np.float64(target[i] - first) * unit
         if far * far > limit:
@@ -107,11 +103,8 @@ def _gain(low, high, weight, total, node_weight, node_total, min_leaf):
     Mirrored splits give exactly the same number, so that ties are ties.
     """
     right = node_weight - weight
-    if (
-        weight < min_leaf
-        or right < min_leaf
-        or value_of(high) <= np.float32(value_of(low) + CONSTANT)
-    ):
+    too_few = weight < min_leaf or right < min_leaf
+    if too_few or value_of(high) <= np.float32(value_of(low) + CONSTANT):
         return -1.0
     gap = np.float64(total) * right - np.float64(node_total - total) * weight
     return gap * gap / (np.float64(weight) * right)
@@ -162,15 +155,14 @@ def choose(rows, first, last, node_weight, node_total, limits, state, order):
 
     Features are visited in random order, so that ties between them fall either way. A
     constant feature counts as tried, but at least one other is tried (scikit-learn's).
-    first, last: the node's rows in its plane; node_weight, node_total: their weight and
-    their sum of targets; limits: (min_samples_leaf, max_features); order: (d,) a
-    permutation of the features, which is shuffled further. Returns a Split and `state`.
+    first, last: the node's rows; node_weight, node_total: their weight and sum of
+    targets; limits: (min_samples_leaf, max_features); order: a permutation of the
+    features, which is shuffled further. Returns a Split and `state`.
     """
     keys, target, weight, d = rows.keys, rows.target, rows.weight, U(order.size)
     min_leaf, max_features = limits
     best, split = -1.0, Split(-1, np.int32(0), np.int64(0), np.int64(0))
-    left = order.size
-    tried, constants = 0, 0
+    left, tried, constants = order.size, 0, 0
     while left > 0 and (tried < max_features or tried == constants):
         state += GOLDEN
         bits = mix(state)

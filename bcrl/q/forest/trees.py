@@ -23,8 +23,7 @@ from bcrl.q.forest.split import (
     uncounted,
 )
 
-#: From so many rows on, it is faster to move them down a tree together.
-TOGETHER = 1000
+TOGETHER = 1000  # from so many rows on, it is faster to move them together
 
 
 class Rows(NamedTuple):
@@ -61,10 +60,7 @@ def _plane(depth):
 
 @inlined
 def _move_rows(rows, n, d, depth, start, stop, feature, cut):
-    """Move the rows start:stop of a node to its children's plane, left ones first.
-
-    Returns the end of the left child's rows.
-    """
+    """Move a node's rows to its children's plane; returns the left child's end."""
     keys, words, origin, target, weight = rows
     a, b = _plane(depth) * n, _plane(depth + 1) * n
     left, right = start, stop - U(1)
@@ -106,7 +102,7 @@ def _move_rows(rows, n, d, depth, start, stop, feature, cut):
 
 @inlined
 def _add_value(origin, start, stop, value, total):
-    """Add a leaf's value to `total` at the rows start:stop that lie in it."""
+    """Add a leaf's value to `total` at its rows start:stop."""
     for i in range(start, stop):
         total[origin[i]] += value
 
@@ -117,10 +113,9 @@ def _grow_tree(
 ):
     """Grow one tree depth first and add its predictions to `fitted` and `queried`.
 
-    rows, queries: `Rows`; whole: weight of all rows, their sum of targets, and the
-    target of fixed-point 1; settings: as in `grow_forest`; work: a permutation of the
-    features and a stack; tree: nodes and values, filled from `at` on if `keep`. Returns
-    the new `at` and the tree's depth.
+    whole: weight of all rows, their sum of targets, and the target of fixed-point 1;
+    work: a permutation of the features and a stack; tree: nodes and values, filled from
+    `at` on if `keep`. Returns the new `at` and the tree's depth.
     """
     min_split, min_leaf, max_features, max_depth = settings
     node_weight, node_total, unit = whole
@@ -131,19 +126,16 @@ def _grow_tree(
     n_nodes, n_values = at
     node, depth, deepest, top = n_nodes, 0, 0, 0
     n_nodes += 1
-    n, n_queries = U(fitted.size), U(queried.size)
-    start, stop, q_start, q_stop = U(0), n, U(0), n_queries
+    n, m = U(fitted.size), U(queried.size)
+    start, stop, q_start, q_stop = U(0), n, U(0), m
     both = d == U(2) and max_features >= 2  # or more than there are features
     while True:
         here = _plane(depth) * n
         first, last = here + start, here + stop
         feature, cut, w_left, s_left = -1, np.int32(0), np.int64(0), np.int64(0)
-        if (
-            node_weight >= min_split
-            and depth < max_depth
-            and node_weight >= 2 * min_leaf
-            and not is_pure(rows.target, rows.weight, first, last, node_weight, unit)
-        ):
+        enough = node_weight >= min_split and node_weight >= 2 * min_leaf
+        may_split = enough and depth < max_depth
+        if may_split and not is_pure(rows, first, last, node_weight, unit):
             if both:
                 split, state = choose_two(
                     rows, first, last, node_weight, node_total, min_leaf, state
@@ -157,7 +149,7 @@ def _grow_tree(
         if feature < 0:
             value = node_total * unit / node_weight
             _add_value(rows.origin, first, last, value, fitted)
-            here = _plane(depth) * n_queries
+            here = _plane(depth) * m
             _add_value(queries.origin, here + q_start, here + q_stop, value, queried)
             if keep:
                 nodes[node].cut, nodes[node].feature = 0, -1
@@ -176,9 +168,7 @@ def _grow_tree(
         middle = _move_rows(rows, n, d, depth, start, stop, feature, cut)
         q_middle = q_start
         if q_start < q_stop:
-            q_middle = _move_rows(
-                queries, n_queries, d, depth, q_start, q_stop, feature, cut
-            )
+            q_middle = _move_rows(queries, m, d, depth, q_start, q_stop, feature, cut)
         if keep:
             nodes[node].cut, nodes[node].feature = cut, feature
             nodes[node].child = n_nodes
@@ -198,26 +188,21 @@ def _grow_tree(
 def grow_forest(x, y, multiplicity, seeds, queries, settings, keep):
     """Grow one tree per seed and predict at the training and the query rows.
 
-    x: (n, d) float32; y: (n,) float64; multiplicity: (n,) int64, or empty if all are 1;
-    seeds: (T,) uint64; queries: (m, d) float32; settings: min_samples_split,
-    min_samples_leaf, max_features, max_depth.
-    Returns nodes, leaf values, first node of each tree (T+1,), depths (T,), fitted
-    (n,), queried (m,); nodes and values are empty unless `keep`.
+    Data as in `Regression`, but an empty multiplicity if all are 1; settings: the
+    fields of `TreeSettings`. Returns nodes, leaf values, first node of each tree
+    (T+1,), depths (T,), fitted (n,), queried (m,); no nodes and values unless `keep`.
     """
     weighted, n, trees = multiplicity.size > 0, x.shape[0], seeds.size
     rows, query_rows = _new_rows(x, True, weighted), _new_rows(queries, False, False)
-    weight, largest = np.int64(0), 0.0
-    for i in range(n):
-        weight += multiplicity[i] if weighted else 1
-        largest = max(largest, abs(y[i]))
+    weight, largest = multiplicity.sum() if weighted else n, np.abs(y).max()
     bits = 0.0
     if largest > 0.0:  # as many as keep every sum of targets below 2^62
         bits = min(62.0 - np.ceil(np.log2(largest) + np.log2(weight)), 1000.0)
     total = np.int64(0)
+    if weighted:
+        rows.weight[:n] = multiplicity
     for i in range(n):
         rows.target[i] = np.int64(np.rint(y[i] * 2.0**bits))
-        if weighted:
-            rows.weight[i] = multiplicity[i]
         total += rows.target[i] * (multiplicity[i] if weighted else 1)
     fitted, queried = np.zeros(n), np.zeros(queries.shape[0])
     work = np.arange(x.shape[1]), np.empty((n + 1, 8), np.int64)
@@ -237,8 +222,7 @@ def grow_forest(x, y, multiplicity, seeds, queries, settings, keep):
 @uncounted
 def _move_down(rows, d, nodes, values, root, stack, total):
     """Add one tree's predictions to `total`, moving all rows down together."""
-    node, depth, top = root, 0, 0
-    n = U(total.size)
+    node, depth, top, n = root, 0, 0, U(total.size)
     start, stop = U(0), n
     while True:
         child, feature = nodes[node].child, nodes[node].feature
@@ -265,10 +249,7 @@ def _move_down(rows, d, nodes, values, root, stack, total):
 
 @uncounted
 def _walk_down(keys, nodes, values, root, at, who, total):
-    """Add one tree's predictions to `total`, level by level for all rows.
-
-    Rows that walk side by side wait for memory at the same time, not one after another.
-    """
+    """Add one tree's predictions to `total`, level by level: reads then overlap."""
     left = total.size
     for i in range(left):
         at[i], who[i] = root, i

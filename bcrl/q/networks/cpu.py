@@ -2,11 +2,8 @@
 
 The same as `mlp` and `DQN`'s torch update, but a seed's parameters stay in the cache,
 and units that are off for a whole batch are left out of the products (`tiles`). A
-seed's floats don't depend on the others. A transition's bootstrap value is cached until
-the target network changes.
-
-A layer's parameters, weights (in, out) and then biases, are one matrix (in + 1, out):
-the input of a layer has a row of ones.
+layer's parameters, weights (in, out) and then biases, are one matrix (in + 1, out): the
+input of a layer has a row of ones.
 """
 
 from typing import NamedTuple
@@ -18,9 +15,7 @@ from numpy.typing import NDArray
 from bcrl.common.compiling import kept
 from bcrl.q.networks.tiles import WIDTH, multiply
 
-#: Moments up to this size become 0: a dead unit's would fade into denormal numbers, on
-#: which processors are many times slower.
-FADED = 1e-30
+FADED = 1e-30  # moments up to this size become 0: denormal numbers are slow
 #: For Adam's division and square root. An infinite weight may turn into one that is not
 #: a number ("ninf"), and that stays one (no "nnan"): either is found.
 _FAST = {"reassoc", "nsz", "arcp", "contract", "afn", "ninf"}
@@ -32,10 +27,7 @@ _entry_point = kept(nogil=True, error_model="numpy")
 
 
 class Room(NamedTuple):
-    """What passes of up to n inputs write, in a network of widths n_0 … n_L.
-
-    Arrays are somewhat larger than said, for the last tiles of rows and columns.
-    """
+    """What passes of n inputs through L layers write, with room for the last tiles."""
 
     units: NDArray[np.float32]  # (L + 1, widest + 1, n): inputs, activations, outputs
     slopes: NDArray[np.float32]  # the same of ∂loss/∂(what a ReLU is given)
@@ -48,7 +40,6 @@ class Room(NamedTuple):
 
 @_compiled
 def space(sizes, n):
-    """Room for up to `n` inputs."""
     layers, widest, wide = len(sizes), sizes.max(), n + WIDTH
     return Room(
         np.zeros((layers, widest + 1, wide), np.float32),
@@ -83,10 +74,9 @@ def forward(flat, sizes, room, n):
         n_in, n_out = sizes[layer], sizes[layer + 1]
         before, after = room.units[layer], room.units[layer + 1]
         alive, m = room.alive[layer], n_in
+        alive[:n_in] = room.all[:n_in]
         if layer:
             m = _relu(before, n_in, n, alive)
-        else:
-            alive[:n_in] = room.all[:n_in]
         before[n_in], alive[m], room.n_alive[layer] = np.float32(1.0), n_in, m
         factors = (alive, m + 1, flat[at:], 1, n_out, before)
         multiply(after, n, room.all, n_out, *factors)
@@ -113,13 +103,10 @@ def _adam(parameters, first, second, gradient, adam):
 
 @_compiled
 def step_of_adam(parameters, first, second, gradient, adam):
-    """Adam's step (Kingma and Ba 2015, algorithm 1) on arrays (P,), in place.
-
-    The last floats are rounded like the others: they go through the same vectors.
-    """
+    """Adam's step (Kingma and Ba 2015, algorithm 1) on arrays (P,), in place."""
     n, whole = len(parameters), len(parameters) // _BLOCK * _BLOCK
     _adam(parameters[:whole], first[:whole], second[:whole], gradient, adam)
-    if whole < n:
+    if whole < n:  # the last floats are rounded like the others, by the same vectors
         rest = np.zeros((4, _BLOCK), np.float32)
         arrays = parameters, first, second, gradient
         for i in range(4):
@@ -144,8 +131,7 @@ def _mask_and_turn(slopes, units, n_units, n, turned):
 def backward(flat, first, second, sizes, room, n, adam):
     """A step of Adam on one seed's network (P,), after `forward` at n inputs.
 
-    first, second (P,): moments; adam: from `Adam.next_step`; room.turned holds
-    ∂loss/∂output, and so does the last of room.slopes.
+    room.turned holds ∂loss/∂output, and so does the last of room.slopes.
     """
     at, last = len(flat), len(sizes) - 2
     above, n_above = room.all, sizes[last + 1]
@@ -175,10 +161,7 @@ def backward(flat, first, second, sizes, room, n, adam):
 
 @_compiled
 def _outputs_at_one(flat, sizes, state, row, out):
-    """Outputs of one seed's network at one state (d,), in `out`; `row` is overwritten.
-
-    Both as long as the widest layer and one. Too little for tiles.
-    """
+    """Outputs at one state (d,), too little for tiles; `row`, `out`: the widest + 1."""
     at, last = 0, len(sizes) - 2
     row[: sizes[0]] = state
     for layer in range(last + 1):
@@ -197,33 +180,22 @@ def _outputs_at_one(flat, sizes, state, row, out):
 @_entry_point
 def outputs(flat, sizes, x):
     """Outputs (S, n, out) of S networks, parameters (S, P), at x (S, n, in)."""
-    n_seeds, n, d = x.shape
-    n_out = sizes[-1]
-    out = np.empty((n_seeds, n, n_out), np.float32)
-    room = space(sizes, n)
+    (n_seeds, n, d), n_out = x.shape, sizes[-1]
+    out, room = np.empty((n_seeds, n, n_out), np.float32), space(sizes, n)
     row, values = np.empty((2, sizes.max() + 1), np.float32)
     for s in range(n_seeds):
         if n == 1:
             _outputs_at_one(flat[s], sizes, x[s, 0], row, values)
             out[s, 0] = values[:n_out]
-            continue
-        for b in range(n):
-            for i in range(d):
-                room.units[0, i, b] = x[s, b, i]
-        found = forward(flat[s], sizes, room, n)
-        for b in range(n):
-            for a in range(n_out):
-                out[s, b, a] = found[a, b]
+        else:
+            room.units[0, :d, :n] = x[s].T
+            out[s] = forward(flat[s], sizes, room, n)[:n_out, :n].T
     return out
 
 
 @_compiled
 def renew(target, sizes, rows, bootstrap, valid, indices, layout, stale, room):
-    """Make one seed's `bootstrap` max_a' (ϱ + base)(s') valid at `indices`.
-
-    rows, bootstrap, valid: the seed's part of `Replay`'s; stale (n,) and room for as
-    many inputs are overwritten: the target is evaluated at up to n rows at a time.
-    """
+    """Make max_a' (ϱ + base)(s') valid at `indices`, up to len(stale) at a time."""
     d, n_actions = layout
     n, last = 0, len(indices) - 1
     for i, place in enumerate(indices):
@@ -246,11 +218,7 @@ def renew(target, sizes, rows, bootstrap, valid, indices, layout, stale, room):
 
 @_entry_point
 def renew_ahead(target, sizes, replay, held, indices, layout):
-    """`renew` for S seeds, at all `indices` (T, S, B) of batches to come.
-
-    This needs fewer and larger passes than batch by batch. Rows that are not among the
-    first `held` ones yet are left out.
-    """
+    """`renew` for S seeds at all `indices` (T, S, B) below `held`: in larger passes."""
     rows, bootstrap, valid = replay
     room, stale = space(sizes, _AHEAD), np.empty(_AHEAD, np.int64)
     for s in range(len(target)):
@@ -264,11 +232,9 @@ def renew_ahead(target, sizes, replay, held, indices, layout):
 def update(networks, sizes, replay, indices, layout, adam, states, loss, next_values):
     """One DQN update of S seeds, in place; the mean loss of each goes to `loss` (S,).
 
-    networks: online and target parameters (S, P) and moments (2, S, P); replay: rows
-    (S, capacity, width), bootstrap and valid (S, capacity) of a `Replay`; indices
-    (S, B) of each seed's batch; layout: d and A; adam: from `Adam.next_step`. While the
-    new parameters are in the cache, `next_values` (S, A) gets the network's outputs at
-    the next states (S, d).
+    networks: online and target parameters (S, P) and moments (2, S, P); replay: a
+    `Replay`'s rows, bootstrap and valid; indices: (S, B); layout: d and A; adam: from
+    `Adam.next_step`. `next_values` (S, A) gets the new outputs at `states` (S, d).
     """
     d, n_actions = layout
     online, target, moments = networks

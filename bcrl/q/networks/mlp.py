@@ -1,20 +1,21 @@
 """Q-networks of S seeds side by side: stacked weights, batched products and Adam.
 
-This module runs on any device. On a CPU, the module `cpu` computes the same faster, in
-compiled code; `DeepQ` and the DQN update choose by the device of the parameters.
+It runs on any device. On a CPU, the module `cpu` computes the same faster, in compiled
+code; `DeepQ` and the DQN update choose by the device of the parameters.
 """
 
+import copy
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from bcrl.common.serialization import DERIVED, storable
-from bcrl.q.functions import Values, check_width, each
+from bcrl.q.functions import Values, check_width
 from bcrl.q.networks import cpu
 
 Tensor = torch.Tensor
@@ -28,11 +29,9 @@ def xavier(
     Weights (in, out) are Xavier-uniform with `gain` (1 in the last layer), biases
     uniform on ±1/√in (Glorot and Bengio 2010; torch's default for biases).
     """
-    parts = []
-    pairs = list(itertools.pairwise(sizes))
-    for layer, (n_in, n_out) in enumerate(pairs):
-        scale = gain if layer < len(pairs) - 1 else 1.0
-        limit = scale * math.sqrt(6.0 / (n_in + n_out))
+    parts, last = [], len(sizes) - 2
+    for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
+        limit = (gain if layer < last else 1.0) * math.sqrt(6.0 / (n_in + n_out))
         parts.append(rng.uniform(-limit, limit, n_in * n_out))
         parts.append(rng.uniform(-1.0, 1.0, n_out) / math.sqrt(n_in))
     return np.concatenate(parts).astype(np.float32)
@@ -41,14 +40,10 @@ def xavier(
 @storable
 @dataclass(eq=False)
 class Networks:
-    """S perceptrons with ReLUs, one per seed; no seed's result depends on the others.
+    """S perceptrons with ReLUs, one per seed; none depends on the others."""
 
-    sizes: the layers' widths (in, hidden …, out); flat: all parameters, (S, P). Inputs
-    have shape (S, n, in).
-    """
-
-    sizes: tuple[int, ...]
-    flat: Tensor
+    sizes: tuple[int, ...]  # the layers' widths (in, hidden …, out)
+    flat: Tensor  # all parameters, (S, P)
     _buffers: dict[int, list[Tensor]] = field(
         default_factory=dict, repr=False, metadata=DERIVED
     )
@@ -61,16 +56,11 @@ class Networks:
             self.layers.append((weights, self.flat[:, None, end : end + n_out]))
             at = end + n_out
 
-    def clone(self) -> "Networks":
-        """Networks with copies of the parameters."""
-        return Networks(self.sizes, self.flat.clone())
-
     def forward(self, x: Tensor) -> Tensor:
-        """Outputs (S, n, out), in a buffer that the next call with n overwrites."""
+        """Outputs (S, n, out) at x (S, n, in); the next call with n overwrites them."""
         n = x.shape[1]
         if n not in self._buffers:
-            widths = self.sizes[1:]
-            self._buffers[n] = [x.new_empty((x.shape[0], n, w)) for w in widths]
+            self._buffers[n] = [x.new_empty((len(x), n, w)) for w in self.sizes[1:]]
         for layer, (weights, biases) in enumerate(self.layers):
             x = x.relu_() if layer else x
             x = torch.baddbmm(biases, x, weights, out=self._buffers[n][layer])
@@ -113,10 +103,6 @@ class Adam:
         """For parameters (S, P) that have not been trained."""
         return cls(parameters.new_zeros((2, *parameters.shape)), rate)
 
-    def clone(self) -> "Adam":
-        """The same step count and copies of the moments."""
-        return replace(self, moments=self.moments.clone())
-
     def next_step(self) -> tuple[float, float, float, float, float]:
         """Count a step; returns β1, β2, bias-corrected rate and scale, and ε."""
         self.steps += 1
@@ -150,9 +136,9 @@ class DeepQ:
         check_width(states, self.online.sizes[0])
         if isinstance(states, np.ndarray):
             return self._values(self.online, states)
-        sizes, rows = self.online.sizes, self.online.flat.split(1)
-        one = [Networks(sizes, row) for row in rows]
-        return each(states, lambda s: self._values(one[s], states[s][None])[0])
+        one = [Networks(self.online.sizes, row) for row in self.online.flat.split(1)]
+        pairs = zip(one, states, strict=True)
+        return [self._values(own, x[None])[0] for own, x in pairs]
 
     def _values(self, networks: Networks, x: NDArray) -> NDArray[np.float64]:
         """Values (S, n, A) at states x (S, n, d)."""
@@ -165,8 +151,7 @@ class DeepQ:
 
     def clone(self) -> "DeepQ":
         """A copy that may be trained on without changing this one."""
-        online, target = self.online.clone(), self.target.clone()
-        return DeepQ(online, target, self.optimiser.clone(), self.steps)
+        return copy.deepcopy(self)
 
     def copy_target(self) -> None:
         """The target becomes the online network."""

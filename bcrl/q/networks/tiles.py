@@ -1,9 +1,8 @@
 """Matrix products in registers, of chosen rows and terms: what a batch leaves alive.
 
-Behind a ReLU a third of a layer's units is off for a whole batch. A library's product
-can't leave them out; here a **tile** of a few rows and columns is summed up over a list
-of terms. The order of a sum is the list's, whatever the processor's vectors: a float
-depends neither on the others nor on the tile.
+Behind a ReLU a third of a layer's units is off for a whole batch. Here a **tile** of a
+few rows and columns is summed up over a list of terms. The order of a sum is the
+list's, whatever the processor: a float depends neither on others nor on the tile.
 """
 
 from itertools import chain
@@ -28,8 +27,7 @@ def _tile(width: int):
     """An intrinsic: `multiply` for ROWS rows and `width` columns."""
 
     def generate(context, b, signature, args):
-        def vectors(array, at):
-            """The addresses of a row's vectors from an array's float `at` on."""
+        def vectors(array, at):  # the addresses of a row's, from float `at` on
             places = [b.add(at, I64(v)) for v in range(0, width, LANES)]
             kind = FLOATS.as_pointer()
             return [b.bitcast(b.gep(array.data, [p]), kind) for p in places]
@@ -84,8 +82,8 @@ _wide, _narrow = _tile(WIDTH), _tile(LANES)
 def multiply(out, columns, rows, n_rows, terms, n_terms, a, across, along, right):
     """out[r] = Σ_t a[r · across + t · along] · right[t] for listed rows r and terms t.
 
-    The first `columns` columns are computed, but up to WIDTH are read and written. What
-    is written behind a row's end is overwritten by the rows below, if they are listed.
+    The first `columns` columns are computed; what is written behind a row's end, up to
+    WIDTH, is overwritten by the rows below, if they are listed.
     """
     for begin in range(0, n_rows, ROWS):
         for column in range((columns - 1) // WIDTH * WIDTH, -1, -WIDTH):

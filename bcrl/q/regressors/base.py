@@ -3,6 +3,7 @@
 import textwrap
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -18,21 +19,18 @@ from bcrl.q.functions import Values
 @storable
 @dataclass(frozen=True)
 class Problem:
-    """The regression of one seed and action, with the points to predict at.
-
-    A fit depends on nothing else, so a checkpoint stores the problem, not the model.
-    """
+    """The regression of one seed and action, and all that its fit depends on."""
 
     x: NDArray[np.float32]  # (n, d)
     y: NDArray[np.float64]  # (n,)
     multiplicity: NDArray[np.int64]  # (n,): how many equal rows each row stands for
-    queries: NDArray[np.float32]  # (m, d)
+    queries: NDArray[np.float32]  # (m, d): the points to predict at
     seed: int
     path: tuple[int, ...]  # of the seed's stream "trees"
 
     @property
     def rng(self) -> np.random.Generator:
-        """The random stream of this fit, from its beginning."""
+        """This fit's random stream, from its beginning."""
         return stream(self.seed, "trees", *self.path)
 
 
@@ -48,9 +46,8 @@ class Fit:
 class Regressor(Protocol):
     """Fits many problems at once; its constructor's arguments are its YAML keys.
 
-    finite_only: whether it needs an environment with finitely many states. It may set
-    `pointwise = True` if no prediction depends, to the last bit, on the other points of
-    a call; then predictions may be cached.
+    finite_only: whether it needs an environment with finitely many states. With
+    `pointwise = True`, predictions may be cached: none depends on the other points.
     """
 
     finite_only: bool
@@ -88,7 +85,8 @@ def fit_each(
 
     def fit(cells: list[Cell]) -> list[Fit]:
         own = [problems[cell] for cell in cells]
-        fits = regressor.fit(list(map(_copied, own)), keep, threads)
+        copies = [deepcopy(problem) for problem in own]  # a regressor may change them
+        fits = regressor.fit(copies, keep, threads)
         for problem, fit in zip(own, fits, strict=True):
             _check_shape(fit.fitted, len(problem.x))
             _check_shape(fit.queried, len(problem.queries))
@@ -120,14 +118,7 @@ def _by_seed(
     return found, failed
 
 
-def _copied(problem: Problem) -> Problem:
-    """The problem in copies of its arrays, because a regressor may change them."""
-    arrays = ("x", "y", "multiplicity", "queries")
-    return replace(problem, **{name: getattr(problem, name).copy() for name in arrays})
-
-
 def _check_shape(values: Any, n: int) -> None:
-    """Raise BcrlError unless there are n predictions."""
     if (shape := np.shape(values)) != (n,):
         raise BcrlError(f"predictions have the shape {shape}, expected ({n},)")
 
@@ -136,11 +127,8 @@ def _reason(regressor: Regressor, what: str, error: Exception) -> str:
     """Which regressor failed and why; for a foreign error also where in the code."""
     text = " ".join(str(error).split())
     if not isinstance(error, BcrlError):
-        kind = type(error).__name__
-        if isinstance(error, MemoryError):
-            kind = "out of memory"
         place = traceback.extract_tb(error.__traceback__)[-1]
-        text = f"{kind}: {text} ({place.filename}:{place.lineno})"
+        text = f"{type(error).__name__}: {text} ({place.filename}:{place.lineno})"
     name = textwrap.shorten(repr(regressor), 200)
     return f"algorithm.regressor={name}: {what} failed: {text}"
 
@@ -155,7 +143,12 @@ class FittedQ:
     team: Any  # its `threads` may be used
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        self._restore()
+        lost = [f for row in self.models for f in row if f and f.model is None]
+        if lost:  # what a checkpoint has left out is fitted again
+            problems = [deepcopy(fitted.problem) for fitted in lost]
+            fits = self.regressor.fit(problems, True, self.team.threads)
+            for fitted, fit in zip(lost, fits, strict=True):
+                fitted.model = fit.model
         models = {
             (s, a): fitted.model
             for s, row in enumerate(self.models)
@@ -178,12 +171,3 @@ class FittedQ:
         for (s, a), values in found.items():
             out[s][:, a] = values
         return np.stack(out) if isinstance(states, np.ndarray) else out
-
-    def _restore(self) -> None:
-        """Fit again the models that a checkpoint left out."""
-        lost = [f for row in self.models for f in row if f and f.model is None]
-        if lost:
-            problems = [_copied(fitted.problem) for fitted in lost]
-            fits = self.regressor.fit(problems, True, self.team.threads)
-            for fitted, fit in zip(lost, fits, strict=True):
-                fitted.model = fit.model

@@ -68,10 +68,7 @@ REGRESSORS = {
 
 
 def regressor_class(name: str) -> type:
-    """The regressor class for the config key `algorithm.regressor.name`.
-
-    A name with dots is a user's class; ConfigError for another name that is unknown.
-    """
+    """The class for `algorithm.regressor.name`; a name with dots is a user's class."""
     key = "algorithm.regressor.name"
     if "." in name:
         return plugins.component(key, name, name)

@@ -31,22 +31,18 @@ class _Fitting(ABC):
     def _model(self, seed: int) -> Any: ...
 
     def fit(self, problems: Sequence[Problem], keep: bool, threads: int) -> list[Fit]:
-        """The fits, in order, each with its own random seed."""
-        seeds = [int(p.rng.integers(2**31)) for p in problems]
+        models = [self._model(int(p.rng.integers(2**31))) for p in problems]
         with threadpool_limits(1):  # sums would depend on the number of threads
-            return list(map(self._fit_one, problems, seeds))
-
-    def _fit_one(self, problem: Problem, seed: int) -> Fit:
-        model = self._model(seed)
-        repeat = np.repeat(np.arange(len(problem.y)), problem.multiplicity)
-        model.fit(problem.x[repeat], problem.y[repeat])
-        both = model.predict(np.concatenate([problem.x, problem.queries]))
-        return Fit(model, *np.split(np.asarray(both, np.float64), [len(problem.y)]))
+            for model, p in zip(models, problems, strict=True):
+                repeat = np.repeat(np.arange(len(p.y)), p.multiplicity)
+                model.fit(p.x[repeat], p.y[repeat])
+        points = [np.concatenate([p.x, p.queries]) for p in problems]
+        found = zip(models, problems, self.predict(models, points, 1), strict=True)
+        return [Fit(model, *np.split(both, [len(p.y)])) for model, p, both in found]
 
     def predict(
         self, models: Sequence[Any], x: Sequence[NDArray], threads: int
     ) -> list[NDArray[np.float64]]:
-        """Each model's predictions (n,) at its own points (n, d)."""
         with threadpool_limits(1):
             found = [m.predict(points) for m, points in zip(models, x, strict=True)]
         return [np.asarray(values, np.float64) for values in found]
@@ -57,8 +53,7 @@ class Sklearn(_Fitting):
     """Any regressor of scikit-learn, by the name of its class and its arguments.
 
     From Python, `estimator` may also be an estimator or a pipeline. `standardise` puts
-    a StandardScaler before it. Each `random_state` gets a new value per fit. Raises
-    ConfigError for a name or an argument that scikit-learn doesn't know.
+    a StandardScaler before it. Each fit has its own `random_state`. Raises ConfigError.
     """
 
     estimator: Any
@@ -118,9 +113,9 @@ class SklearnForest(TreeKeys, _Fitting):
     def _model(self, seed: int) -> Any:
         from sklearn.ensemble import ExtraTreesRegressor
 
-        leaf, split = self.min_samples_leaf, self.min_samples_split
-        keys = {"min_samples_leaf": leaf, "min_samples_split": split}
-        return ExtraTreesRegressor(self.trees, random_state=seed, **keys)
+        keys = {"min_samples_split": self.min_samples_split, "random_state": seed}
+        keys["min_samples_leaf"] = self.min_samples_leaf
+        return ExtraTreesRegressor(self.trees, **keys)
 
 
 @functools.cache
