@@ -6,9 +6,8 @@ from numpy.typing import NDArray
 
 def writable(array: NDArray) -> NDArray[np.float64]:
     """The array as compiled code takes it: float64, contiguous and writable."""
-    if array.flags.carray and array.dtype == np.float64:  # usual, and 20 times as fast
-        return array
-    return np.require(array, np.float64, "CW")
+    usual = array.flags.carray and array.dtype == np.float64
+    return array if usual else np.array(array, np.float64, order="C")
 
 
 def ndtri(u: NDArray[np.float64]) -> NDArray[np.float64]:

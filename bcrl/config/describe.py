@@ -9,7 +9,7 @@ import yaml
 
 from bcrl.common.identity import flat
 from bcrl.config.hydra_compose import CONF
-from bcrl.errors import BcrlError, guess
+from bcrl.errors import BcrlError, closest
 
 #: The groups whose options bring keys.
 GROUPS = (
@@ -92,7 +92,8 @@ def describe(word: str) -> str:
         listed.setdefault(entry.key, entry.parts[0].partition(". ")[0])
     if listed:
         return "\n".join(f"{name}: {text.rstrip('.')}" for name, text in listed.items())
-    meant = guess(key, (e.key for e in known)) or "bcrl --describe lists all keys"
+    near = closest(key, [e.key for e in known])
+    meant = f"did you mean {near}?" if near else "bcrl --describe lists all keys"
     raise BcrlError(f"--describe {key}: unknown key; {meant}")
 
 

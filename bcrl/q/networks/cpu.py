@@ -160,21 +160,29 @@ def backward(flat, first, second, sizes, room, n, adam):
 
 
 @_compiled
+def _row_times(row, weights, out):
+    """row (in,) · weights (in, out); a function of its own, to be vectorised."""
+    out[:] = np.float32(0.0)
+    for k in range(len(row)):
+        if row[k] != 0:  # as behind a ReLU that is off
+            for j in range(len(out)):
+                out[j] += row[k] * weights[k, j]
+
+
+@_compiled
 def _outputs_at_one(flat, sizes, state, row, out):
     """Outputs at one state (d,), too little for tiles; `row`, `out`: the widest + 1."""
     at, last = 0, len(sizes) - 2
     row[: sizes[0]] = state
     for layer in range(last + 1):
         n_in, n_out = sizes[layer], sizes[layer + 1]
-        row[n_in], out[:n_out] = np.float32(1.0), np.float32(0.0)
-        for k in range(n_in + 1):
-            if row[k] != 0:  # as behind a ReLU that is off
-                for j in range(n_out):
-                    out[j] += row[k] * flat[at + j]
-            at += n_out
+        end = at + (n_in + 1) * n_out
+        row[n_in] = np.float32(1.0)
+        weights = flat[at:end].reshape(n_in + 1, n_out)
+        _row_times(row[: n_in + 1], weights, out[:n_out])
         if layer < last:
-            for j in range(n_out):
-                row[j] = max(out[j], np.float32(0.0))
+            row[:n_out] = np.maximum(out[:n_out], np.float32(0.0))
+        at = end
 
 
 @_entry_point
@@ -182,7 +190,8 @@ def outputs(flat, sizes, x):
     """Outputs (S, n, out) of S networks, parameters (S, P), at x (S, n, in)."""
     (n_seeds, n, d), n_out = x.shape, sizes[-1]
     out, room = np.empty((n_seeds, n, n_out), np.float32), space(sizes, n)
-    row, values = np.empty((2, sizes.max() + 1), np.float32)
+    row = np.empty(sizes.max() + 1, np.float32)
+    values = np.empty_like(row)  # in separate memory, so that loops are vectorised
     for s in range(n_seeds):
         if n == 1:
             _outputs_at_one(flat[s], sizes, x[s, 0], row, values)
