@@ -58,10 +58,7 @@ class Files(caching.IndexDataCacheFile):
 
 
 def _source_stamp(locator: Any) -> str:
-    """What outdates a function's code: a change of any module beside the function's.
-
-    Compiled code contains the functions that it calls; ours stand in the same package.
-    """
+    """What outdates a function's code: a change of any module in its folder."""
     paths = sorted(Path(locator._py_file).parent.glob("*.py"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
 

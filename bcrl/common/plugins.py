@@ -69,9 +69,7 @@ def module(key: str, name: str, where: str, known: Collection[str] = ()) -> Modu
     if not all(part.isidentifier() for part in where.split(".")):
         raise ConfigError(key, name, "isn't the name of a module")
     if where.partition(".")[0] not in known and not is_trusted(where):
-        why = (
-            "a config alone can't name code: type it, or pass its folder (--config-dir)"
-        )
+        why = "a config alone can't name code: type it, or pass its --config-dir"
         raise ConfigError(key, name, why)
     try:
         return importlib.import_module(where)

@@ -36,9 +36,8 @@ class Stop:
                 signal.signal(number, signal.SIG_DFL)
                 os.kill(os.getpid(), number)
             if not self.requested:
-                text = (
-                    f"bcrl: {signal.Signals(number).name}: saving; once more to quit\n"
-                )
+                name = signal.Signals(number).name
+                text = f"bcrl: {name}: saving; once more to quit\n"
                 with suppress(*GONE):
                     os.write(2, text.encode())  # print may be interrupted itself
             came.add(number)

@@ -3,7 +3,7 @@
 import copy
 import inspect
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -76,11 +76,6 @@ class Recipe:
                 env = _wrapped(env, wrapper)
             undone.pop_all()
         return env
-
-    def mapping(self) -> Callable[[Any], Any] | None:
-        """The function `observation`; ConfigError if it isn't trusted or missing."""
-        name = self.observation
-        return plugins.attribute("env.observation", name, name) if name else None
 
 
 def spec_of(name: str) -> EnvSpec:

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from bcrl.common import plugins
 from bcrl.common.serialization import DERIVED, storable
 from bcrl.common.signals import Interrupted
 from bcrl.envs.base import Bools, Floats, Lanes
@@ -47,7 +48,8 @@ class Simulator:
     def open(self) -> None:
         """Make a new environment; it is closed at the latest when the process exits."""
         self.close()
-        self._map = self.recipe.mapping()
+        name = self.recipe.observation
+        self._map = plugins.attribute("env.observation", name, name) if name else None
         self.env = self._call("the constructor", self.recipe.make, self.render_mode)
         self._finalizer = weakref.finalize(self, _close, self.env)
         self.seen = np.empty(0)

@@ -181,9 +181,8 @@ class DQNTrainer:
         if block != self._block:
             width, found = CHOICES + self.env.step_noise + self.env.initial_noise, []
             for of, n in (("exploration", width), ("replay", self.settings.batch_size)):
-                rngs = [
-                    stream(s, of, self.stage.number, block) for s in self.batch.seeds
-                ]
+                path = self.stage.number, block
+                rngs = [stream(seed, of, *path) for seed in self.batch.seeds]
                 found.append(np.stack([rng.random((DRAW_BLOCK, n)) for rng in rngs], 1))
             self._uniforms, picks = found  # (DRAW_BLOCK, S, n)
             self._indices = self.state.replay.indices(picks, at)
@@ -240,7 +239,7 @@ class DQNTrainer:
         now.step += 1
         now.deep.steps += 1
         if now.deep.steps % self.settings.target_update == 0:
-            now.deep.copy_target()
+            now.deep.target.flat.copy_(now.deep.online.flat)
             now.replay.valid[:] = False
 
     def pause(self) -> Pause:
@@ -257,9 +256,8 @@ class DQNTrainer:
         weights = torch.isfinite(now.deep.online.flat).all(1).cpu().numpy()
         failed: dict[int, str] = {}
         for part, finite in (("loss", np.isfinite(now.loss)), ("weights", weights)):
-            failed |= dict.fromkeys(
-                np.flatnonzero(~finite).tolist(), f"non-finite {part}"
-            )
+            lost = np.flatnonzero(~finite).tolist()
+            failed |= dict.fromkeys(lost, f"non-finite {part}")
         loss = now.loss / now.updates if now.updates else now.loss + np.nan
         now.loss, now.updates = np.zeros_like(loss), 0
         result = StageResult(self.start.total(now.deep), now.deep)

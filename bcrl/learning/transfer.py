@@ -4,8 +4,6 @@ A transfer edits the next stage's `StageInit`, which is all that learners read. 
 can be combined: `Boost` and `Shape` make SBC-DQN.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -39,7 +37,7 @@ class Boost:
     maxima: Literal["one", "two"] = "one"
     mask_at_goal: bool = True
 
-    def __call__(self, start: StageInit, previous: StageResult) -> StageInit:
+    def __call__(self, start: "StageInit", previous: StageResult) -> "StageInit":
         return replace(start, base=previous.q, boost=self)
 
 
@@ -55,7 +53,7 @@ class Shape:
     next_state: Literal["stored", "before_reset"] = "stored"
     zero_at_goal: bool = True
 
-    def __call__(self, start: StageInit, previous: StageResult) -> StageInit:
+    def __call__(self, start: "StageInit", previous: StageResult) -> "StageInit":
         return replace(start, potential=previous.q, shape=self)
 
 
@@ -72,7 +70,7 @@ class PolicyReuse:
         if not 0.0 <= self.nu <= 1.0:
             raise ConfigError("transfer.nu", self.nu, "must lie in [0, 1]")
 
-    def __call__(self, start: StageInit, previous: StageResult) -> StageInit:
+    def __call__(self, start: "StageInit", previous: StageResult) -> "StageInit":
         return replace(start, prior=previous.q, behavior=self)
 
 
@@ -89,7 +87,7 @@ class ResidualPolicy:
     def __post_init__(self) -> None:
         at_least("transfer.offset", self.offset, 0)
 
-    def __call__(self, start: StageInit, previous: StageResult) -> StageInit:
+    def __call__(self, start: "StageInit", previous: StageResult) -> "StageInit":
         return replace(start, prior=previous.q, behavior=self)
 
 
@@ -112,7 +110,7 @@ class StageInit:
             return add(self.base, residual)
         return Shaped(self.base, residual, self.potential)
 
-    def memoized(self) -> StageInit:
+    def memoized(self) -> "StageInit":
         """The same with a base and a potential that cache their values."""
         base, same = memoized(self.base), self.potential is self.base
         potential = base if same else memoized(self.potential)

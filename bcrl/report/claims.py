@@ -11,7 +11,7 @@ from scipy import stats
 
 from bcrl.report import statistics, tables
 from bcrl.report.statistics import FEWEST_SEEDS, Interval
-from bcrl.report.tables import ABSENT, TEXTS, Section, TextTable, number
+from bcrl.report.tables import ABSENT, PARAGRAPHS, Section, TextTable, number
 from bcrl.report.variants import Methods, Runs, Variant, incomplete, listed, tags_shown
 
 _OPTIMAL = 1e-3  # a return this near V*(s0) is optimal: a detour costs 100 times more
@@ -93,7 +93,7 @@ def claims_report(runs: Runs, tag: str | None = None) -> str:
     if lacking := incomplete(notes):
         parts.append(f"**{lacking}**\n")
     sections = claims_sections(runs, tag).values()
-    parts += [TEXTS["claims"], TEXTS["glossary"], *map(str, sections)]
+    parts += [PARAGRAPHS["claims"], PARAGRAPHS["glossary"], *map(str, sections)]
     if notes:
         parts += ["## Notes on the runs\n", *(f"- {note.text}" for note in notes), ""]
     return "\n".join(parts)
@@ -199,7 +199,7 @@ def _values(variants: Iterable[Variant]) -> list[str | TextTable]:
             low, high = map(number, statistics.share_interval(hits, n))
             row["seeds solving the target"] = f"{hits}/{n} [{low}, {high}]"
         rows.append(row)
-    parts: list[str | TextTable] = [TEXTS[variant.family], TextTable(rows)]
+    parts: list[str | TextTable] = [PARAGRAPHS[variant.family], TextTable(rows)]
     columns = [f"stage {k + 1}" for k in range(max(v.stage[-1] for v in variants))]
     for metric in (name for name in _AT_ENDS if name in common):
         rows = []

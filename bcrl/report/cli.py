@@ -16,7 +16,7 @@ from bcrl.report.claims import claims_report
 from bcrl.report.figures import curves, linear, maze, style
 from bcrl.report.load import load_runs
 from bcrl.report.page import page
-from bcrl.report.tables import TEXTS, aggregate, sweep_sections, sweep_table
+from bcrl.report.tables import PARAGRAPHS, aggregate, sweep_sections, sweep_table
 from bcrl.report.variants import COMPARED, LINEAR, Runs, env_title
 from bcrl.results.arguments import ResultsParser
 
@@ -35,9 +35,7 @@ CURVES = "curves"  # learning curves of what the paper has no figure of
 
 def _parser() -> ResultsParser:
     """The command line; its help is the reference."""
-    about = (
-        "Draw figures of finished runs, test the paper's claims, write an HTML page."
-    )
+    about = "Draw figures of finished runs, test the paper's claims, write a page."
     result = ResultsParser("bcrl-report", about)
     add = result.add_argument
     text = "smoke, quick, paper, search or your own; default: %(default)s"
@@ -106,7 +104,7 @@ def report(
     compared = sweep_table(runs)
     if sweeps := sweep_sections(compared):
         title = f"# Variants compared, scale {runs.scale}\n"
-        parts = [title, TEXTS["sweeps"], *map(str, sweeps)]
+        parts = [title, PARAGRAPHS["sweeps"], *map(str, sweeps)]
         write(f"sweep_{runs.scale}.md", "\n".join(parts))
         write(f"sweep_{runs.scale}.csv", compared)
     agents = [

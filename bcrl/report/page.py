@@ -16,7 +16,7 @@ from bcrl import __version__
 from bcrl.common.identity import differences, flat, identity
 from bcrl.report.claims import claims_sections
 from bcrl.report.curve_data import curve_data
-from bcrl.report.tables import ABSENT, TEXTS, Section, TextTable, duration, number
+from bcrl.report.tables import ABSENT, PARAGRAPHS, Section, TextTable, duration, number
 from bcrl.report.variants import Runs, env_title, incomplete
 from bcrl.results.layout import seed_path, spelled
 
@@ -35,7 +35,7 @@ def page(
     browsers that run no scripts; `agents` move."""
     notes, claims = runs.notes_on(tag), claims_sections(runs, tag)
     return _JINJA.get_template("page.html").render(
-        {"version": __version__, "texts": TEXTS, "runs": runs, "tag": tag},
+        {"version": __version__, "texts": PARAGRAPHS, "runs": runs, "tag": tag},
         notes=notes,
         incomplete=incomplete(notes),
         facts=_facts(runs, claims),
@@ -83,7 +83,7 @@ def costs(runs: Runs) -> list[str | TextTable]:
             cells = (variant.name, str(n), number(seconds / n), duration(seconds))
             rows.append((*cells, f"{peak:.0f}" if peak else ABSENT))
     table = TextTable([dict(zip(header, row, strict=True)) for row in rows])
-    return [TEXTS["costs"], table]
+    return [PARAGRAPHS["costs"], table]
 
 
 def configurations(runs: Runs) -> list[dict[str, Any]]:

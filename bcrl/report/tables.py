@@ -17,7 +17,7 @@ from bcrl.results.layout import INDEX, spelled
 ABSENT = "–"  # a cell without a value
 _PATH = Path(__file__).with_name("templates") / "texts.yaml"
 _TEXT = _PATH.read_text("utf-8").format(fewest=FEWEST_SEEDS, window=WINDOW)
-TEXTS = yaml.safe_load(_TEXT)  # paragraphs of the documents and the page, by name
+PARAGRAPHS = yaml.safe_load(_TEXT)  # paragraphs of the documents and the page, by name
 _DECISIVE = {"FQI": "last_return", "DQN": "late_return"}  # means that rank variants
 
 

@@ -104,7 +104,7 @@ HERE = [OpenCorridor()]
 SENSELESS = {
     "0 tasks": ([], LEARNER),
     "there are 2 learners": (HERE, [LEARNER] * 2),
-    r"such as Boost\(\)": (HERE, LEARNER, Boost),
+    r"or Boost\(\)": (HERE, LEARNER, Boost),
     "one task": (HERE, LEARNER, ResidualPolicy()),
     "is no regressor": (HERE, FQI(1, 1, Tabular)),
     r"Sklearn\(estimator\)": (HERE, FQI(1, 1, KNeighborsRegressor())),

@@ -123,7 +123,7 @@ def test_the_seed_shown_is_neither_the_best_nor_the_worst(tmp_path):
     ("changed", "message"),
     [
         ({"arrays": {"trajectory": np.zeros((7, 2))}}, "trajectory_actions"),
-        ({"arrays": episode() | {"trajectory": np.zeros((7, 5))}}, "Error: "),
+        ({"arrays": episode() | {"trajectory": np.zeros((7, 1))}}, "Error: "),
         ({"section": SECTION | {"name": "my.car"}}, "a config alone can't name code"),
     ],
 )

@@ -20,6 +20,8 @@ import numpy as np
 from bcrl.errors import BcrlError, at_least
 from bcrl.q.forest.trees import grow_forest, predict_forest
 
+_pool = cache(ThreadPoolExecutor)  # starting threads costs more than a small call
+
 
 @dataclass(frozen=True)
 class TreeSettings:
@@ -175,12 +177,6 @@ def _spread(function: Callable, items: Sequence, threads: int) -> list:
     at_least("threads", threads, 1)
     threads = min(threads, len(items), 4 * (os.cpu_count() or 1))
     return list((_pool(threads).map if threads > 1 else map)(function, items))
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    """One pool for all calls, because starting threads costs more than a small call."""
-    return ThreadPoolExecutor(threads)
 
 
 def _points(name: str, x: np.ndarray, d: int | None = None) -> np.ndarray:

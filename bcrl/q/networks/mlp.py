@@ -152,7 +152,3 @@ class DeepQ:
     def clone(self) -> "DeepQ":
         """A copy that may be trained on without changing this one."""
         return copy.deepcopy(self)
-
-    def copy_target(self) -> None:
-        """The target becomes the online network."""
-        self.target.flat.copy_(self.online.flat)
