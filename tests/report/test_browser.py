@@ -203,9 +203,18 @@ def test_it_can_be_read_without_scripts(page):
 
 def test_the_policy_forbids_requests(page):
     """What the other tests watch for would be seen, and would not get out."""
+    url = "http://[::1]/x"
+    image = "document.body.append(Object.assign(new Image(), {src: arguments[0]}))"
+    page.script(image, url)
     failed = "fetch(arguments[0]).catch(() => arguments[1]())"
-    page.driver.execute_async_script(failed, "http://[::1]/x")
+    page.driver.execute_async_script(failed, url)
     messages = [entry["message"] for entry in page.driver.get_log("browser")]
+    assert any("img-src" in text for text in messages)
     assert any("default-src" in text for text in messages)
-    failed = page.events()["Network.loadingFailed"]
-    assert any(event.get("blockedReason") == "csp" for event in failed)
+    events = page.events()
+    sent = [
+        e for e in events["Network.requestWillBeSent"] if e["request"]["url"] == url
+    ]
+    failures = events["Network.loadingFailed"]
+    reasons = {each["requestId"]: each.get("blockedReason") for each in failures}
+    assert sent and all(reasons[each["requestId"]] == "csp" for each in sent)
