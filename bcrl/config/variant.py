@@ -67,7 +67,7 @@ class Composition:
         elif residual and getattr(self.tasks[-1], "actions", None) is None:
             why = "combines actions as vectors, which env.action_vectors has to name"
         elif residual and start.base is not ZERO:
-            why = "learns Q of its own actions, a base of executed ones: boosting=off"
+            why = "learns Q of learned actions, a base of executed ones: boosting=off"
         if why:
             raise ConfigError("transfer", transfer, why)
         for key, one in (("transfer", transfer), ("boosting", boost)):

@@ -1,4 +1,4 @@
-"""Probes measure snapshots of some seeds; here also what FQI's iterations are asked."""
+"""Probes measure the snapshots of several seeds; the metrics of FQI's iterations."""
 
 from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache

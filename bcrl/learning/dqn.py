@@ -223,7 +223,7 @@ class DQNTrainer:
         return own, self._combined[advised, own]
 
     def update(self) -> None:
-        """One gradient step for each seed, on a batch of its own."""
+        """One gradient step for each seed, each on its batch."""
         now, target_update = self.state, self.settings.target_update
         at, since = now.step % DRAW_BLOCK, now.deep.steps % target_update
         # After a copy of the target (or a new block) the batches until the next one.

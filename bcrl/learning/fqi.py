@@ -42,7 +42,7 @@ class FQI:
     """Fitted Q-iteration for many seeds at once (Ernst et al. 2005; paper, Eq. 5).
 
     Every iteration fits, for each seed and action, a new regressor to
-    r + γ max_a' Q(s', a') − base(s, a). What is constant in a stage is computed once.
+    r + γ max_a' Q(s', a') − base(s, a). Constant terms are computed once per stage.
     """
 
     iterations: int

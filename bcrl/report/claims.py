@@ -57,7 +57,7 @@ def _gap(variant: Variant) -> np.ndarray:
     return variant.last("return") - variant.optimum
 
 
-#: What is measured of a variant: (S,) values, or hits to be counted.
+#: The measures of a variant: (S,) values, or hits to be counted.
 MEASURES = {
     "error": lambda v: v.last("q_error"),
     "return": lambda v: v.last("return"),

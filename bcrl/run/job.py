@@ -45,7 +45,7 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
             begun = checkpoints.batches(plan)
             if not (resumes := seeds in begun):
                 seeds = tuple(records.pending(plan, held))
-            # The batch of a checkpoint resumes as a whole, in a job of its own.
+            # The batch of a checkpoint resumes as a whole, in a separate job.
             others = set(seeds) - held.keys() if resumes else set().union(*begun)
             if not seeds or others & set(seeds):
                 return {}

@@ -107,7 +107,7 @@ GROWTH = "\n".join(f"    a{i + 1}: ${{.a{i}}}${{.a{i}}}" for i in range(60))
 YAMLS = {
     "an object": "tag: !!python/object/apply:os.system ['touch canary']",
     "bytes": "tag: !!binary aGk=",
-    "a tag of one's own": "tag: !mine x",
+    "an unknown tag": "tag: !mine x",
     "nested": "a: " + "[" * 3000 + "]" * 3000,
     "long": "a: [" + "1," * 100_000 + "1]",
     "a launcher": "hydra: {launcher: {_target_: os.system}}",

@@ -48,7 +48,7 @@ def test_products_are_numpys(n_rows, columns, n_terms):
     assert np.allclose(found, expected, atol=1e-4)
     assert np.array_equal(run(*given, columns, turned=True), found)
     assert np.array_equal(run(*given, columns, room=0), found)
-    rows, terms, a, right = given  # a column is the same in any company
+    rows, terms, a, right = given  # a column does not depend on the others
     for column in (0, columns // 2, columns - 1):
         alone = run(rows, terms, a, np.roll(right, -column, 1), 1)
         assert np.array_equal(alone[:, 0], found[:, column])

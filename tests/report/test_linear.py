@@ -84,7 +84,7 @@ def test_curves_are_the_means_of_the_records(tmp_path):
     assert line.get_xdata().tolist() == tables[0]["step"][target].tolist()
     mean = sum(tables) / len(tables)
     assert line.get_ydata() == pytest.approx(mean["return"][target].to_numpy())
-    assert len(lines) == len(SEVEN)  # all have colours of their own
+    assert len(lines) == len(SEVEN)  # no two have the same colour
     dotted = [float(x.get_xdata()[0]) for x in left.lines if x.get_linestyle() == ":"]
     assert sorted(dotted) == [2000, 10500]
     assert {t.get_text() for t in left.texts} >= {"LSPI → target", "DQN on LQ → target"}

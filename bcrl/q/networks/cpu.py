@@ -161,7 +161,7 @@ def backward(flat, first, second, sizes, room, n, adam):
 
 @_compiled
 def _row_times(row, weights, out):
-    """row (in,) · weights (in, out); a function of its own, to be vectorised."""
+    """row (in,) · weights (in, out); a separate function, so that it is vectorised."""
     out[:] = np.float32(0.0)
     for k in range(len(row)):
         if row[k] != 0:  # as behind a ReLU that is off
