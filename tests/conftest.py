@@ -22,7 +22,8 @@ def _trusts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 def arguments(*overrides: str, multirun=False, config_dir=None) -> Namespace:
     """What `bcrl *overrides` parses to."""
     words = {"overrides": list(overrides), "multirun": multirun}
-    return Namespace(**words, config_dir=config_dir, config_name=None)
+    unset = {"config_name": None, "cfg": None, "unnamed": False}
+    return Namespace(**words, **unset, config_dir=config_dir)
 
 
 def plans(*overrides: str, **options) -> list[Plan]:

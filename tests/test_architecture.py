@@ -16,8 +16,7 @@ from bcrl.common.moved import MOVED
 PACKAGE = Path(bcrl.__file__).parent
 #: Names that each module of one kind defines: environments, algorithms, oracles,
 #: commands; `run` trains in both interfaces, `bcrl.api` and the runner.
-PROTOCOLS = {"ENV", "PRESETS", "FAMILY", "LOCKSTEP", "Settings", "stages"}
-PROTOCOLS |= {"reference", "table", "main", "parser", "run"}
+PROTOCOLS = {"ENV", "FAMILY", "LOCKSTEP", "stages", "reference", "table", "main", "run"}
 
 
 def test_no_modules_import_each_other_in_a_circle():

@@ -42,9 +42,9 @@ def arguments() -> Namespace:
             hints = Hints(tuple(w for w in words if re.match(r"[^-].*=", w)))
             # What --runs-dir says its key says, too.
             long = [x for x in names if x[:2] == "--" and x != "--runs-dir"]
-            if not (near := closest(name, long, 0.7)):
-                raise BcrlError(f"{word}: unknown flag; {hints.meant(words, place)}")
-            raise BcrlError(f"{word}: unknown flag; did you mean {near}?")
+            near = closest(name, long, 0.7)
+            meant = f"did you mean {near}?" if near else hints.meant(words, place)
+            raise BcrlError(f"{word}: unknown flag; {meant}")
     asked = flags.parse_intermixed_args()
     if asked.runs_dir is not None:
         quoted = asked.runs_dir.replace('"', r"\"")
@@ -60,8 +60,8 @@ def for_hydra(asked: Namespace) -> list[str]:
     for action in flag_parser()._actions:
         value = getattr(asked, action.dest, None)
         if value and action.dest not in _OURS:
-            short, long = (f(action.option_strings, key=len) for f in (min, max))
-            given.append(short if value is True else f"{long}={value}")
+            name = max(action.option_strings, key=len)
+            given.append(name if value is True else f"{name}={value}")
     return given
 
 

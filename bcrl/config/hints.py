@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 
 from bcrl.common.identity import Plain, flat
 from bcrl.config import hydra_compose as compose
-from bcrl.config.describe import entries
+from bcrl.config.describe import GROUPS, entries
 from bcrl.config.overrides import parse
 from bcrl.config.schema import Config
 from bcrl.errors import BcrlError, closest
@@ -55,7 +55,12 @@ class Hints:
     def brought(self) -> dict[str, str]:
         """The keys that options bring into their section, and the first such option."""
         known = [e for e in reversed(entries()) if e.group]
-        return {e.key: f"{e.group}={next(iter(e.defaults))}" for e in known}
+        found = {e.key: f"{e.group}={next(iter(e.defaults))}" for e in known}
+        groups = [g for g in GROUPS if self.folders and g != "scale"]  # always there
+        for group, name in ((g, o) for g in groups for o in self.groups[g]):
+            for key in flat(compose.read_option(group, name, self.folders)):
+                found.setdefault(f"{group.replace('/', '.')}.{key}", f"{group}={name}")
+        return found
 
     @cached_property
     def spellings(self) -> dict[str, str]:
@@ -127,8 +132,11 @@ class Hints:
             if alone or re.match(r"\s*[\w./]+\s+=", word):
                 meant = self.meant(self.overrides, place)
                 raise BcrlError(f"{word!r} can't be read as KEY=VALUE; {meant}")
-        for override in parse(self.overrides):
-            if why := self._wrong(override):
+        parsed = parse(self.overrides)
+        asked = [o.get_key_element() for o in parsed if o.key_or_group[:5] == "hydra"]
+        for override in parsed:
+            twice = asked.count(override.get_key_element()) > 1
+            if why := "is given twice" if twice else self._wrong(override):
                 raise BcrlError(f"{override.input_line}: {why}")
 
     def _wrong(self, override: Override) -> str | None:
@@ -141,7 +149,9 @@ class Hints:
             return "every run needs a choice of it, or its default" if needed else None
         if key in self.groups and not isinstance(value, str | Sweep | Glob):
             return f"name one option, or leave {key} out; {self.of_option(key, value)}"
-        optional = key in ("budget", "tuned", "local")  # any option passes in Hydra
+        if key == "tuned":
+            return "follows from the other choices; override the keys themselves"
+        optional = key in ("budget", "local")  # any option passes in Hydra
         if optional and isinstance(value, str | Sweep):
             for name in [value] if is_text else override.sweep_string_iterator():
                 if name not in self.groups.get(key, ()):

@@ -1,9 +1,7 @@
 """Hydra's composition of one job, and what the folders of configs hold."""
 
 import contextlib
-import os
 import re
-import time
 from datetime import datetime
 from functools import cache
 from pathlib import Path
@@ -25,7 +23,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 #: In a wheel the configs lie inside the package, in a checkout beside it.
 CONF = next(p for p in (PACKAGE / "conf", PACKAGE.parent / "conf") if p.is_dir())
 CONFIG_NAME = "config"
-STARTED = "BCRL_STARTED"  # when the command began, in its jobs' processes, too
+STARTED = datetime.now()
 #: Hydra's messages about a key that can't be overridden, added or deleted.
 UNKNOWN = re.compile(
     r"Could not override '([^']+)'|Could not append.* already at '([^']+)'"
@@ -47,8 +45,7 @@ class Unknown(BcrlError):
 
 def now(pattern: str) -> str:
     """`${now:%H-%M}`: when the command began, one time in all of its jobs."""
-    began = float(os.environ.setdefault(STARTED, str(time.time())))
-    return datetime.fromtimestamp(began).strftime(pattern)
+    return STARTED.strftime(pattern)
 
 
 def register_plugins() -> None:

@@ -1,7 +1,5 @@
 """The jobs of a command line: each composed, checked and planned before any work."""
 
-import hashlib
-import itertools
 import json
 import shlex
 from argparse import Namespace
@@ -13,6 +11,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from bcrl.common import plugins
+from bcrl.common.files import sha256
 from bcrl.common.identity import OUTPUT_KEYS, Plain, differences, flat
 from bcrl.config import hydra_compose, safety, schema
 from bcrl.config import plan as planning
@@ -37,7 +36,7 @@ def plans(arguments: Namespace) -> list[Plan]:
     arguments.overrides = canonical(arguments.overrides, folders)
     hints = Hints(tuple(arguments.overrides), folders)
     parsed = parse(arguments.overrides)
-    if multirun and getattr(arguments, "cfg", None):
+    if multirun and arguments.cfg:
         raise BcrlError("--cfg shows one composition; drop -m and the sweep")
     swept = {o.key_or_group for o in parsed if o.is_sweep_override()}
     if swept and not multirun:
@@ -57,7 +56,7 @@ def plans(arguments: Namespace) -> list[Plan]:
     except hydra_compose.Unknown as error:
         raise BcrlError(hints.explained(error)) from error
     # What a folder says is the user's own, unless nobody named the folder.
-    own = not getattr(arguments, "unnamed", False) and bool(folders)
+    own = not arguments.unnamed and bool(folders)
     made = [_plan(job, folders, None if own else overrides) for job in found]
     if any(plan.launcher for plan in made):
         if not multirun and found[0].hydra.mode != RunMode.MULTIRUN:
@@ -75,8 +74,7 @@ def plans(arguments: Namespace) -> list[Plan]:
 
 def _folders(arguments: Namespace) -> Paths:
     """The folders of configs besides ours, which leave the overrides."""
-    given = [arguments.config_dir] if arguments.config_dir else []
-    found = list(getattr(arguments, "folders", given))
+    found = [arguments.config_dir] if arguments.config_dir else []
     searched = [o for o in arguments.overrides if o.startswith("hydra.searchpath=")]
     arguments.overrides = [o for o in arguments.overrides if o not in searched]
     for override in parse(searched):
@@ -112,7 +110,8 @@ def _plan(job: DictConfig, folders: Paths, typed: Sequence[str] | None) -> Plan:
     if choices["env"] == OPEN and OmegaConf.is_missing(job.env, "id"):
         raise ConfigError("env.id", "???", "name an environment: env.id=CartPole-v1")
     name = choices.get("variant")
-    for entry in read_option("variant", name, folders).get("defaults", ()):
+    entries = read_option("variant", name, folders).get("defaults", ())
+    for entry in (each for each in entries if isinstance(each, dict)):  # not `_self_`
         ((key, option),) = entry.items()
         group = key.removeprefix("override /")
         if (other := choices.get(group, option)) != option:
@@ -133,7 +132,8 @@ def _plan(job: DictConfig, folders: Paths, typed: Sequence[str] | None) -> Plan:
     try:
         return planning.plan(config, env, tag, **more)
     except ConfigError as error:
-        option = choices.get(error.key.replace(".", "/"))  # as it was typed
+        name = str(flat(config).get(f"{error.key}.name"))  # as it was typed
+        option = name if "." in name else choices.get(error.key.replace(".", "/"))
         if option is None or error.key == "env":
             raise
         raise ConfigError(error.key, option, error.allowed) from error
@@ -160,14 +160,14 @@ def _tag(config: Plain, hydra: DictConfig, folders: Paths) -> str | None:
         return config["tag"]
     choices = hydra.runtime.choices
     usual: dict[str | None, dict[str, str]] = {None: {}, "released": {}}
-    for tag, group in itertools.product(usual, VARIANT_GROUPS[1:]):
+    for group in VARIANT_GROUPS[1:]:
         name = config[group].get("name")
         if group in ("curriculum", "boosting"):
             name = "off" if name == "off" else "on"
-        if tag:
-            name = RELEASED.get(f"{group}={name}", name)
-        shipped = (CONF / group / f"{name}.yaml").exists()
-        usual[tag][group] = name if shipped else choices[group]
+        released = RELEASED.get(f"{group}={name}", name)
+        for tag, option in ((None, name), ("released", released)):
+            shipped = (CONF / group / f"{option}.yaml").exists()
+            usual[tag][group] = option if shipped else choices[group]
     if not folders and _only_chooses(hydra):
         for tag, named in usual.items():
             if named.items() <= dict(choices).items():
@@ -183,7 +183,7 @@ def _tag(config: Plain, hydra: DictConfig, folders: Paths) -> str | None:
             return tag
         changes.append({key: value for key, (value, _) in changed.items()})
     text = json.dumps(changes[0], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:8]
+    return sha256(text.encode())[:8]
 
 
 def _only_chooses(hydra: DictConfig) -> bool:

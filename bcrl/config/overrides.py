@@ -45,24 +45,26 @@ def canonical(overrides: Sequence[str], folders: Paths) -> list[str]:
     """The overrides as Hydra should read them; what is canonical stays as it is."""
     if "hydra/launcher=local" in overrides:  # a former launcher
         say("hydra/launcher=local: this launcher is gone; workers=N takes its place")
-        renamed = [o.replace("hydra.launcher.n_jobs=", "workers=") for o in overrides]
+        number = r"hydra\.launcher\.n_jobs=(?=\d)"  # -1 meant all cores
+        renamed = [re.sub(number, "workers=", o) for o in overrides]
         overrides = [o for o in renamed if not re.match("hydra[/.]launcher", o)]
         if not any(o.startswith("workers=") for o in overrides):
             overrides.append(f"workers={os.cpu_count()}")
     found: dict[str, str] = {}  # of a key of seeds the last one holds
-    for text in (text for each in overrides for text in _canonical(each, folders)):
+    groups = catalog(folders)
+    for text in (text for each in overrides for text in _canonical(each, groups)):
         key = text.partition("=")[0] if text.startswith("seeds.") else text
         found.pop(key, None)
         found[key] = text
     return list(found.values())
 
 
-def _canonical(text: str, folders: Paths) -> Iterator[str]:
+def _canonical(text: str, groups: dict[str, list[str]]) -> Iterator[str]:
     text = NOW.sub(lambda found: now(found[1]), text)
     (override,) = parse([text])
     key, value = override.key_or_group, override.value()
     head, equals, raw = text.partition("=")
-    known = catalog(folders).get(key, [])  # a group's options
+    known = groups.get(key, [])  # a group's options
     swept = isinstance(value, types.ChoiceSweep)
     values: list[Any] = value.list if swept else [value]  # type: ignore[union-attr]
     if override.is_delete() or not equals:
@@ -80,7 +82,7 @@ def _canonical(text: str, folders: Paths) -> Iterator[str]:
         if not names:
             why = f"glob(…) picks options of a group; {key} has {', '.join(known)}"
             raise ConfigError(key, raw, why)
-        yield from _canonical(f"{head}={','.join(names)}", folders)
+        yield from _canonical(f"{head}={','.join(names)}", groups)
     else:
         is_text = known or key in TEXTS or key.endswith((".name", ".id"))
         written = CHOICE.sub(r"\1\2", raw).split(",") if swept else [raw]

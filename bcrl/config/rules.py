@@ -43,7 +43,6 @@ def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...
     other settings of the last. The scale caps the budgets. Raises ConfigError for what
     can't be learned, or would have no effect.
     """
-    chosen.check()
     _check(chosen, learners)
     slots = list(zip(chosen.order, learners, strict=True))
     all_dqn = [learner for learner in learners if isinstance(learner, DQN)]

@@ -53,7 +53,7 @@ class Composition:
         """What a later stage starts from, as far as transfers tell without training."""
         return handed.tried(self.transfers)
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Raise ConfigError for choices that make no sense together."""
         boost, transfer, start = self.boost, self.transfer, self.start
         if len(self.order) == 1 and self._chosen:
@@ -81,9 +81,7 @@ def composition(config: Plain, tasks: list[Env]) -> Composition:
     boost = _component("boosting", config["boosting"], {"on": handed.Boost})
     transfer = _component("transfer", config["transfer"], handed.TRANSFERS)
     order = order_of(config["curriculum"]["name"], tasks)
-    made = Composition(tuple(tasks), order, boost, transfer, config["scale"])
-    made.check()  # before budgets, which are lists with one entry per task
-    return made
+    return Composition(tuple(tasks), order, boost, transfer, config["scale"])
 
 
 def order_of(curriculum: object, tasks: Sequence[Env]) -> tuple[int, ...]:

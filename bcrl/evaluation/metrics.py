@@ -51,6 +51,11 @@ def check_metrics(metrics: Sequence[str], target: Env) -> None:
         raise ConfigError("env.metrics", "q_error_start", why)
 
 
+def needs_reference(metrics: Sequence[str]) -> bool:
+    """Whether a metric compares with Q*, which an oracle has to search."""
+    return any(name.startswith("q_error") for name in metrics)
+
+
 class SeedProbe:
     """Measures the snapshots of several seeds, and keeps what each stage ends with."""
 
@@ -91,8 +96,8 @@ class Probe(SeedProbe):
     ) -> None:
         super().__init__(seeds, tasks)
         self.metrics, self.states = metrics, probed_states(self.target)
-
-        start, reference, q_star = _layout(self.target, self.target)
+        self.compares = needs_reference(metrics)
+        start, reference, q_star = _layout(self.target, self.target, self.compares)
         known = len(start) == 1 and (reference == start).any()
         #: V*(s0) of the target, if the oracle knows the only evaluation state.
         self.optimum = float(q_star[reference == start].max()) if known else None
@@ -114,7 +119,7 @@ class Probe(SeedProbe):
         returns = episodes.discounted_return(env.gamma)
         solved = episodes.solved(rollout.success_of(env))
         learned = (snapshot.probed_q, snapshot.probed_residual, returns, solved)
-        known = (*_layout(env, self.target), self.optimum)
+        known = (*_layout(env, self.target, self.compares), self.optimum)
         rows = []
         for s, outcome in enumerate(zip(*learned, strict=True)):
             view = View(*outcome, *known)
@@ -147,14 +152,11 @@ def probed_states(target: Env) -> Floats:
     """All states of an env that lists them, else those that metrics need, (n, d)."""
     if hasattr(target, "states"):
         return target.states()
-    needed = [target.evaluation_states()]
-    if known := oracle.reference(target):
-        needed.append(known.states)
-    return np.unique(np.concatenate(needed), axis=0)
+    return np.unique(target.evaluation_states(), axis=0)
 
 
 @lru_cache(maxsize=64)
-def _layout(env: Env, target: Env) -> tuple[Integers, Integers, Floats]:
+def _layout(env: Env, target: Env, compares: bool) -> tuple[Integers, Integers, Floats]:
     """Rows of the start states and of Q*'s states among the probed ones, and Q*."""
     states = probed_states(target)
 
@@ -166,6 +168,7 @@ def _layout(env: Env, target: Env) -> tuple[Integers, Integers, Floats]:
 
     # A simulator's starts are random: Q is recorded where the target may start.
     start = rows((target if is_simulated(env) else env).evaluation_states())
-    if (known := oracle.reference(env)) is None:
+    # A single start state has a known optimum, which the metadata names.
+    if not (compares or len(start) == 1) or (known := oracle.reference(env)) is None:
         return start, np.empty(0, np.intp), np.empty((0, env.n_actions))
     return start, rows(known.states), known.q

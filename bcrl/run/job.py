@@ -43,11 +43,12 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
             np.errstate(divide=strict, over=strict, invalid=strict),
         ):
             begun = checkpoints.batches(plan)
-            if not (resumes := seeds in begun):
+            if resumes := seeds in begun:  # as a whole, so it needs all of its locks
+                busy = len(held) < len(seeds)
+            else:  # the seeds of a checkpoint belong to a separate job
                 seeds = tuple(records.pending(plan, held))
-            # The batch of a checkpoint resumes as a whole, in a separate job.
-            others = set(seeds) - held.keys() if resumes else set().union(*begun)
-            if not seeds or others & set(seeds):
+                busy = any(set(batch) & set(seeds) for batch in begun)
+            if not seeds or busy:
                 return {}
             try:
                 job = replace(job, seeds=seeds, resumes=resumes)
@@ -70,6 +71,9 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
 
 
 def _reason(error: Exception) -> str:
+    if isinstance(error, MemoryError):
+        text = f"out of memory: {error} (try fewer workers or seeds.lockstep)"
+        return " ".join(text.split())
     known = isinstance(error, BcrlError)
     return str(error) if known else f"{type(error).__name__}: {error}"
 
@@ -80,9 +84,9 @@ class _Training:
     def __init__(self, job: Job, held: dict[int, locks.Lock], log: loggers.Log) -> None:
         self.job, self.held, self.log = job, held, log
         self.plan, self.seeds = plan, seeds = job.plan, job.seeds
-        self.probe: Probe | StepProbe = Probe(seeds, plan.tasks, plan.metrics)
-        if plan.family == "DQN":
-            self.probe = StepProbe(seeds, plan.tasks)
+        dqn, common = plan.family == "DQN", (seeds, plan.tasks)
+        self.probe: Probe | StepProbe
+        self.probe = StepProbe(*common) if dqn else Probe(*common, plan.metrics)
         batch = SeedBatch(seeds, self.probe.states, job.threads, plan.device)
         self.run = CurriculumRun(plan.stages, batch)
         self.rows: list[list[dict[str, Any]]] = [[] for _ in seeds]  # of the CSVs

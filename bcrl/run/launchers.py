@@ -148,5 +148,5 @@ def _squeue(*options: str) -> tuple[str | None, str]:
     except (OSError, subprocess.TimeoutExpired) as error:
         return None, str(error)
     if done.returncode:
-        return None, f"exit code {done.returncode}, {done.stderr.strip()}"
+        return None, f"exit code {done.returncode}, {' '.join(done.stderr.split())}"
     return done.stdout.strip(), ""

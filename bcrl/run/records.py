@@ -132,7 +132,8 @@ def named(seeds: Sequence[int]) -> str:
 
 def by_reason(name: str, reasons: Mapping[int, str]) -> list[str]:
     """A line for each reason: `maze FQI, seeds 0–2: the CSV is missing`."""
-    return [
-        f"{name}, {named([seed for seed in reasons if reasons[seed] == why])}: {why}"
-        for why in dict.fromkeys(reasons.values())
-    ]
+    lines = []
+    for why in dict.fromkeys(reasons.values()):
+        seeds = [seed for seed in reasons if reasons[seed] == why]
+        lines.append(f"{name}, {named(seeds)}: {why}")
+    return lines

@@ -9,6 +9,7 @@ from bcrl.common.terminal import say
 from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
 from bcrl.evaluation import oracle
+from bcrl.evaluation.metrics import needs_reference
 from bcrl.results.layout import COMPLETE, seed_name
 from bcrl.run import checkpoints, costs, job, locks, records, status
 from bcrl.run.origin import run_origin
@@ -42,7 +43,7 @@ def run(*plans: Plan) -> None:
                 _wait(jobs, quiet, stop)
     if jobs:
         raise Interrupted
-    for plan in plans if not quiet else ():
+    for plan in () if quiet else plans:
         for line in status.diverging_lines(plan):
             say(line)
     _check(plans, failed)
@@ -90,9 +91,9 @@ def _prepare(plan: Plan, quiet: bool) -> None:
 def _train(jobs: Sequence[Job], failed: Failures, stop: Stop) -> None:
     """Do the jobs, as far as no other process has their seeds; note failed seeds."""
     for plan in (each.plan for each in jobs):
-        if plan.family == "FQI" and any(m.startswith("q_error") for m in plan.metrics):
+        if plan.family == "FQI" and needs_reference(plan.metrics):
             for task in (plan.target, *(stage.env for stage in plan.stages)):
-                oracle.reference(task)  # once, for all processes
+                oracle.reference(task)  # without Q*, the command ends before any work
     options = jobs[0].plan.config
     workers = min(options["workers"], len(jobs))
     threads = options["threads"] or max(1, cores() // workers)
@@ -114,7 +115,7 @@ def _train(jobs: Sequence[Job], failed: Failures, stop: Stop) -> None:
 
 def _is_free(work: Job) -> bool:
     """Whether this process can train something of a job; of a checkpoint's, all."""
-    held = [locks.is_held(work.plan.directory, seed) for seed in work.seeds]
+    held = (locks.is_held(work.plan.directory, seed) for seed in work.seeds)
     return not (any(held) if work.resumes else all(held))
 
 
@@ -123,5 +124,7 @@ def _wait(jobs: Sequence[Job], quiet: bool, stop: Stop) -> None:
     if not quiet:
         lock = locks.Lock(jobs[0].plan.directory, seed_name(jobs[0].seeds[0]))
         say(f"waiting for {len(jobs)} jobs: {lock.path} is held by {lock.holder()}")
+    pause = 0.1
     while not (stop.requested or any(map(_is_free, jobs))):
-        time.sleep(0.2)
+        time.sleep(pause)
+        pause = min(2.0, 1.5 * pause)

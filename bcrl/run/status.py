@@ -46,7 +46,7 @@ def status(arguments: Namespace) -> str:
         for path in sorted(plan.root.glob(f"*/*/*/{layout.CONFIG}")):
             begun = layout.recorded_seeds(path.parent, "json")
             documents = [records.read_facts(path.parent, seed) for seed in begun]
-            ever = set().union(*(layout.requested(each) for each in documents if each))
+            ever = set(begun).union(*(layout.requested(d) for d in documents if d))
             asked.append((path.parent, sorted(ever)))
         if not asked:
             raise BcrlError(f"runs_dir={plan.root}: holds no runs")

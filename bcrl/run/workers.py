@@ -55,7 +55,8 @@ def do_jobs(
                     why = f"its process ended with exit code {process.exitcode}"
                     killed = process.exitcode == -signal.SIGKILL
                     kind, message = "result", _KILLED if killed else why
-                    pool |= [_started(do)] if waiting else []
+                    if waiting:
+                        pool.update([_started(do)])
                 if kind == "report":
                     report(doing[pipe], message)
                 else:

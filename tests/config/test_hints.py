@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from bcrl import cli
-from bcrl.config import flags, hydra_compose, jobs
+from bcrl.config import flags, jobs
 from bcrl.errors import BcrlError
 from bcrl.report import cli as report
 from bcrl.results import verify
@@ -114,8 +114,7 @@ def test_seeds_are_swept_and_stand_in_files(tmp_path):
             assert made.seeds == those
 
 
-def test_a_command_has_one_time(monkeypatch, tmp_path):
-    monkeypatch.delenv(hydra_compose.STARTED, raising=False)
+def test_a_command_has_one_time(tmp_path):
     folder = own(tmp_path, "runs_dir: out/${now:%H-%M-%S.%f}", "local/default")
     typed, chosen = "runs_dir=out/${now:%H-%M-%S.%f}", (MAZE, "curriculum=on,off")
     for given, place in (((typed,), None), ((), folder)):

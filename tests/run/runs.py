@@ -30,7 +30,7 @@ CART = ("env.horizon=90", "scale.max_steps=150", "algorithm.learning_starts=60")
 KINDS = {
     f"{env} {name}": (f"env={env}", f"variant={name}", *FQI)
     for env in ("car_on_hill", "maze")
-    for name in ("plain", "C", "B", "BC")
+    for name in ("plain", "C", "B", "BC", "SC")
 }
 KINDS |= {f"dqn {name}": (*DQN, f"variant={name}") for name in METHODS}
 KINDS["dqn RPL"] += ("transfer.offset=510",)
