@@ -68,7 +68,7 @@ def by_turns(runs: list[Iterator[Iteration]]) -> list[tuple[float, float]]:
             began = time.process_time()
             now = next(run)
             took = (time.process_time() - began) * 1e3
-            forests = [f for models in now.result.residual.models for f in models]
+            forests = [f.model for own in now.result.residual.models for f in own]
             best[i] = min(best[i], (took, np.mean([np.diff(f.first) for f in forests])))
     return best
 

@@ -4,12 +4,12 @@ import importlib
 from collections.abc import Sequence
 
 from bcrl.common import plugins
-from bcrl.common.checks import construct
+from bcrl.common.checks import construct, one_of
 from bcrl.common.identity import Plain
 from bcrl.common.registration import REGISTERED
 from bcrl.envs.base import Env, FiniteEnv, Success, is_finite, is_simulated, lanes_of
 from bcrl.envs.checks import check_pure_tasks
-from bcrl.errors import BcrlError, ConfigError, did_you_mean
+from bcrl.errors import ConfigError
 
 __all__ = ["Env", "FiniteEnv", "Success", "is_finite", "is_simulated", "lanes_of"]
 __all__ += ["check_tasks", "env_class", "env_names", "tasks_of"]
@@ -27,8 +27,9 @@ def check_tasks(name: str, tasks: Sequence[Env]) -> None:
     for key in ("state_dim", "n_actions"):
         found = [getattr(task, key, None) for task in tasks]
         if found.count(found[0]) < len(found):
-            why = f"is {found}, expected the same in all tasks; "
-            why += "env.tasks.observation can make observations of one length"
+            why = f"is {found}, expected the same in all tasks"
+            if key == "state_dim" and is_simulated(tasks[-1]):
+                why += "; env.tasks.observation can make observations of one length"
             raise ConfigError("env.tasks", key, why)
     if is_simulated(target := tasks[-1]):
         target.check_tasks(tasks)
@@ -37,11 +38,10 @@ def check_tasks(name: str, tasks: Sequence[Env]) -> None:
 
 
 def env_class(name: str) -> type:
-    """The class called `name`, here or in a trusted module; BcrlError for others."""
+    """The class called `name`, here or in a trusted module; ConfigError for others."""
     if plugins.is_foreign(name, env_names()):
         return plugins.component("env.name", name, f"{name}.ENV")
-    if name not in env_names():
-        raise BcrlError(f"env.name={name}: {did_you_mean(name, env_names())}")
+    one_of("env.name", name, env_names())
     return importlib.import_module(f"bcrl.envs.{name}").ENV
 
 

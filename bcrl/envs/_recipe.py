@@ -36,7 +36,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "miniworld": ("MiniWorld-",),
     "shimmy": ("dm_control/", "bsuite/"),
 }
-_RESERVED = ("max_episode_steps", "disable_env_checker")  # arguments that bcrl sets
+_SET = {"max_episode_steps": -1, "disable_env_checker": True}  # arguments
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Recipe:
         mode = _checked("env.kwargs", creator, kwargs).get("render_mode")
         if render_mode or (mode and mode.default is inspect.Parameter.empty):
             kwargs["render_mode"] = "rgb_array"
-        kwargs |= {"max_episode_steps": -1, "disable_env_checker": True}
+        kwargs |= _SET
         with warnings.catch_warnings(), ExitStack() as undone:
             warnings.simplefilter("ignore", UserWarning)  # of precision, old versions
             env: gymnasium.Env = gymnasium.make(spec, **kwargs)
@@ -93,7 +93,8 @@ def spec_of(name: str) -> EnvSpec:
     why = f"isn't registered; {hint}env.id=module:Name-v0 imports the module first"
     for owner, begins in PACKAGES.items():
         missing = find_spec(owner) is None
-        if missing if owner == module else plain.startswith(begins):
+        named = owner == module
+        if (named and missing) or (not named and plain.startswith(begins)):
             install = f"pip install {owner.replace('_', '-')}, then " if missing else ""
             why = f"{install}env.id={owner}:{plain} imports the package first"
     raise ConfigError("env.id", name, why)
@@ -105,10 +106,10 @@ def _checked(key: str, function: Any, arguments: Mapping[str, Any]) -> dict[str,
         parameters = dict(inspect.signature(function).parameters)
     except (TypeError, ValueError):  # it has no readable signature
         return {}
-    known = [name for name in parameters if name not in (*_RESERVED, "env")]
+    known = [name for name in parameters if name not in (*_SET, "env")]
     anything = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
     for name, value in arguments.items():
-        if name in _RESERVED or (name == "render_mode" and value != "rgb_array"):
+        if name in _SET or (name == "render_mode" and value != "rgb_array"):
             why = "is set by bcrl; only render_mode=rgb_array is allowed"
             raise ConfigError(f"{key}.{name}", value, why)
         if name not in known and not anything:
@@ -128,7 +129,7 @@ def _set_attribute(env: gymnasium.Env, key: str, value: Any) -> None:
     before = known[key]
     old, new = np.asarray(before), np.asarray(value)
     kinds = {old.dtype.kind, new.dtype.kind}
-    alike = np.isfinite(new).all() if kinds <= {*"iuf"} else kinds in ({"b"}, {"U"})
+    alike = np.isfinite(new).all() if kinds <= set("iuf") else kinds in ({"b"}, {"U"})
     if not alike or old.shape != new.shape:
         raise ConfigError(place, value, f"must be like {before!r}, and finite")
     if isinstance(before, np.ndarray):

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeGuard
 
 import numpy as np
@@ -155,7 +155,7 @@ def lanes_of(env: Env) -> Lanes:
 
 def check_episodes(gamma: float, horizon: int) -> None:
     """Raise ConfigError for a discount outside [0, 1) or a horizon below 1."""
-    if not 0.0 <= gamma < 1.0:
-        raise ConfigError("env.gamma", gamma, "must lie in [0, 1)")
+    if not (isinstance(gamma, Real) and 0 <= gamma < 1):
+        raise ConfigError("env.gamma", gamma, "must be a number in [0, 1)")
     if not isinstance(horizon, Integral) or horizon < 1:
         raise ConfigError("env.horizon", horizon, "must be an integer ≥ 1 (steps)")

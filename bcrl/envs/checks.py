@@ -1,5 +1,6 @@
 """Random play before any work; `gymnasium.py` has the trial of a simulator."""
 
+import copy
 import functools
 import itertools
 import reprlib
@@ -78,7 +79,7 @@ def check_different(tasks: Sequence, traces: Sequence, allowed_by: str) -> None:
             ]
             why = f"tasks {number} and {number + 1} behave alike in random play; "
             why += f"if they should, {allowed_by} accepts them"
-            raise ConfigError("env.tasks", ", ".join(changes), why)
+            raise ConfigError("env.tasks", ", ".join(changes) or "equal", why)
 
 
 def check_pure_tasks(name: str, tasks: Sequence[Env]) -> None:
@@ -146,15 +147,19 @@ def _trial(env: Env) -> tuple[list[tuple[bytes, ...]], Floats]:
 
 def _answers(env: Env, method: str, *arguments: NDArray) -> list[NDArray]:
     before = [argument.copy() for argument in arguments]
-    twice = [getattr(env, method)(*arguments) for _ in range(2)]
+    given = getattr(env, method)(*arguments)
+    kept = copy.deepcopy(given)  # the second answer may be a view of the same buffer
+    again = getattr(env, method)(*arguments)
     same = all(map(np.array_equal, arguments, before))
     _require(same, f"{method} changes its arguments; it must copy them")
     nouns = ("states", "rewards", "absorbing") if method == "step" else ("states",)
-    firsts, seconds = (x if isinstance(x, tuple) else (x,) for x in twice)
+    raws, firsts, seconds = (
+        x if isinstance(x, tuple) else (x,) for x in (given, kept, again)
+    )
     why = f"{method} gives {len(firsts)} values; it must give {', '.join(nouns)}"
     _require(len(firsts) == len(seconds) == len(nouns), why)
     found = []
-    for noun, first, second in zip(nouns, firsts, seconds, strict=True):
+    for noun, raw, first, second in zip(nouns, raws, firsts, seconds, strict=True):
         shape, dtype = getattr(first, "shape", None), getattr(first, "dtype", None)
         lanes = arguments[0].shape[:-1] if arguments else (shape or (1,))[:1]
         expected = (*lanes, env.state_dim) if noun == "states" else lanes
@@ -168,6 +173,6 @@ def _answers(env: Env, method: str, *arguments: NDArray) -> list[NDArray]:
         why = f"{method} gives other {noun} the second time; use noise for randomness"
         _require(np.array_equal(first, second), why)
         why = f"{method} gives one array again and again; it must make new ones"
-        _require(first is not second or not first.flags.writeable, why)
+        _require(raw is not second or not raw.flags.writeable, why)
         found.append(np.asarray(first, bool if noun == "absorbing" else float))
     return found

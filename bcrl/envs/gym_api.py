@@ -12,10 +12,9 @@ from gymnasium.vector.utils import batch_space
 from bcrl.common.checks import construct
 from bcrl.envs import Env, env_class
 from bcrl.envs.base import Bools, Floats, Ints
+from bcrl.envs.checks import LARGEST
 from bcrl.envs.rendering import draw, frames_per_second
 from bcrl.errors import ConfigError
-
-UNBOUNDED = float(np.finfo(np.float32).max)  # Gymnasium warns of infinite bounds
 
 
 class GymEnv(gymnasium.Env):
@@ -36,7 +35,9 @@ class GymEnv(gymnasium.Env):
         self.metadata = self.metadata | {"render_fps": frames_per_second(self.task)}
         everything = np.array([[-np.inf], [np.inf]]).repeat(self.task.state_dim, 1)
         bounds = getattr(self.task, "bounds", everything)
-        low, high = np.clip(bounds, -UNBOUNDED, UNBOUNDED)
+        low, high = np.clip(
+            bounds, -LARGEST, LARGEST
+        )  # Gymnasium warns of infinite ones
         self.observation_space = Box(low, high, dtype=np.float64)
         self.action_space = Discrete(self.task.n_actions)
         self._path: list[Floats] = []  # the episode's states
@@ -81,6 +82,8 @@ class GymVectorEnv(VectorEnv):
         max_episode_steps: int | None = None,
         **given: Any,
     ) -> None:
+        if (mode := given.pop("render_mode", None)) is not None:
+            raise ConfigError("render_mode", mode, "must be None: it draws no pictures")
         one = GymEnv(env, **given)
         self.task, self.num_envs = one.task, num_envs
         self.single_observation_space = one.observation_space

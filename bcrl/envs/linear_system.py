@@ -111,15 +111,15 @@ class LinearSystem:
 
     def push(self, state: Floats, force: Floats, noise: Floats) -> Step:
         """One step with any force (..., 2); the fresh start, if any, is in `noise`."""
-        rows = map(_rows, (state, force, ndtri(noise[..., :4]), noise))
-        lead, task = np.shape(state)[:-1], (self.constants[2], self.task == "lq")
+        lead, rows = _rows(state, force, ndtri(noise[..., :4]), noise)
+        task = self.constants[2], self.task == "lq"
         after, reward, arrived = _push(*rows, self._dynamics, *task)
         return after.reshape(*lead, 4), reward.reshape(lead), arrived.reshape(lead)
 
     def before_reset(self, state: Floats, action: Ints, noise: Floats) -> Floats:
         """Where `step` leads before a fresh start replaces it, (..., 4)."""
-        rows = map(_rows, (state, ACTIONS[action], ndtri(noise[..., :4])))
-        return _moved(*rows, self._dynamics).reshape(np.shape(state))
+        lead, rows = _rows(state, ACTIONS[action], ndtri(noise[..., :4]))
+        return _moved(*rows, self._dynamics).reshape(*lead, 4)
 
     def evaluation_states(self) -> Floats:
         """(−4, 0, 0, 0) and the corners of half the target's start box, (17, 4)."""
@@ -145,8 +145,16 @@ class LinearSystem:
         }
 
 
-def _rows(array: Floats) -> Floats:
-    return writable(array).reshape(-1, np.shape(array)[-1])
+def _rows(*arrays: Floats) -> tuple[tuple[int, ...], list[Floats]]:
+    """The arrays' common leading axes, and each array as rows (n, k) over them."""
+    leads = [array.shape[:-1] for array in map(np.asarray, arrays)]
+    lead, rows = leads[0], []
+    if leads.count(lead) < len(leads):  # rare, and broadcasting costs more than a step
+        lead = np.broadcast_shapes(*leads)
+        arrays = tuple(np.broadcast_to(a, (*lead, a.shape[-1])) for a in arrays)
+    for array in arrays:
+        rows.append(writable(array).reshape(-1, array.shape[-1]))
+    return lead, rows
 
 
 @kept(nogil=True)

@@ -7,9 +7,10 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.common.checks import one_of
 from bcrl.common.seeding import stream
 from bcrl.envs import Env, is_simulated
-from bcrl.errors import BcrlError, ConfigError, did_you_mean
+from bcrl.errors import BcrlError, ConfigError
 from bcrl.evaluation import oracle
 from bcrl.learning import Booleans, Floats, Integers, rollout
 from bcrl.learning.fqi import Iteration
@@ -26,7 +27,7 @@ class View(NamedTuple):
     start: Integers  # (E,) the starts of the episodes among the probed states
     reference: Integers  # (n,) the states with a known Q* among the probed states
     q_star: Floats  # (n, A) Q* of the trained task there
-    optimum: float  # V*(s0) of the *target* task; None if unknown
+    optimum: float | None  # V*(s0) of the *target* task, if known
 
 
 #: name in the CSV → its definition (docs/reference/metrics.md explains them)
@@ -42,8 +43,7 @@ METRICS: dict[str, Callable[[View], float]] = {
 def check_metrics(metrics: Sequence[str], target: Env) -> None:
     """Raise ConfigError for a metric that is unknown or undefined for `target`."""
     for name in metrics:
-        if not isinstance(name, str) or name not in METRICS:
-            raise ConfigError("env.metrics", name, did_you_mean(str(name), METRICS))
+        one_of("env.metrics", name, [*METRICS])
         if name.startswith("q_error") and not oracle.has_oracle(target):
             raise ConfigError("env.metrics", name, f"no Q* of {target.name} is known")
     if "q_error_start" in metrics and len(target.evaluation_states()) != 1:

@@ -58,8 +58,10 @@ class DQN:
     def epsilon_at(self, step: int) -> float:
         """ε in a step of the stage, counted from 0."""
         trained, over = step - self.random_steps, self.anneal_steps
-        if trained < 0 or trained >= over:
-            return 1.0 if trained < 0 else self.epsilon
+        if trained < 0:
+            return 1.0
+        if trained >= over:
+            return self.epsilon
         return self.epsilon_start + (self.epsilon - self.epsilon_start) * trained / over
 
     def learn(
@@ -102,13 +104,14 @@ class DQNTrainer:
 
     def __init__(
         self,
-        of: DQN,
+        settings: DQN,
         stage: Stage,
         start: StageInit,
         batch: SeedBatch,
         state: Any = None,
     ) -> None:
-        self.settings, self.stage, self.start, self.batch = of, stage, start, batch
+        self.settings, self.stage = settings, stage
+        self.start, self.batch = start, batch
         self.env, self.n_actions = stage.env, stage.env.n_actions
         self.state = now = state or self._initial_state()
         updater = one_by_one if now.replay.rows.is_cpu else batched
@@ -180,9 +183,9 @@ class DQNTrainer:
         block, at = divmod(self.state.step, DRAW_BLOCK)
         if block != self._block:
             width, found = CHOICES + self.env.step_noise + self.env.initial_noise, []
-            for of, n in (("exploration", width), ("replay", self.settings.batch_size)):
-                path = self.stage.number, block
-                rngs = [stream(seed, of, *path) for seed in self.batch.seeds]
+            path, batch_size = (self.stage.number, block), self.settings.batch_size
+            for purpose, n in (("exploration", width), ("replay", batch_size)):
+                rngs = [stream(seed, purpose, *path) for seed in self.batch.seeds]
                 found.append(np.stack([rng.random((DRAW_BLOCK, n)) for rng in rngs], 1))
             self._uniforms, picks = found  # (DRAW_BLOCK, S, n)
             self._indices = self.state.replay.indices(picks, at)
@@ -218,8 +221,11 @@ class DQNTrainer:
         if not isinstance(behavior, ResidualPolicy):
             return own, own
         advised = greedy(prior, u[..., 2])
-        copying = (now.n_greedy_decisions < behavior.offset) & (u[..., 0] >= epsilon).T
-        own = np.where(copying.T, advised, own)
+        copying = (
+            now.n_greedy_decisions < behavior.offset
+        )  # seeds; greedy lanes of them
+        copying = copying.reshape(-1, *[1] * (own.ndim - 1)) & (u[..., 0] >= epsilon)
+        own = np.where(copying, advised, own)
         return own, self._combined[advised, own]
 
     def update(self) -> None:
@@ -266,13 +272,12 @@ class DQNTrainer:
         return StepSnapshot(self.stage, count, now, result, *measured, failed=failed)
 
     def _evaluated_policy(self, states: Any, u: Floats, alive: Any) -> Integers:
-        """A `Policy`: half of the lanes explore, the other half is greedy.
-
-        Greedy lanes do not reuse the prior (PPR).
-        """
+        """A `Policy`: half of the lanes explore, the rest is greedy and without PPR."""
         start, settings = self.start, self.settings
         exploring = np.repeat([True, False], settings.evaluation_episodes)
         epsilon = np.where(exploring, settings.evaluation_epsilon, 0.0)
-        parts = (self.state.deep, start.base, start.prior)
-        residual, base, prior = (q(states, self.n_actions) for q in parts)  # (S, E, A)
+        residual = self.state.deep(states, self.n_actions)  # (S, E, A)
+        base = prior = start.base(states, self.n_actions)
+        if start.prior is not start.base:
+            prior = start.prior(states, self.n_actions)
         return self._choose(residual, (base, None, prior), u, epsilon, exploring)[1]

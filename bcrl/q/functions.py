@@ -29,8 +29,11 @@ def each(states: Sequence[NDArray], values: Callable[[int], NDArray]) -> Values:
     return np.stack(found) if isinstance(states, np.ndarray) else found
 
 
-def check_width(states: Sequence[NDArray], d: int) -> None:
-    """Raise BcrlError unless all states have `d` entries, as compiled code needs."""
+def check_states(states: Sequence[NDArray], n_seeds: int, d: int) -> None:
+    """Raise BcrlError unless there are `n_seeds` arrays of states with `d` entries."""
+    if len(states) != n_seeds:  # compiled code would read beyond its arrays
+        why = f"a Q-function of {n_seeds} seeds can't be evaluated at states of "
+        raise BcrlError(f"{why}{len(states)}; pass one array of states per seed")
     for x in states[:1] if isinstance(states, np.ndarray) else states:
         if x.shape[-1] != d:
             raise BcrlError(
@@ -151,5 +154,5 @@ class Table:
     env: FiniteEnv
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        check_width(states, self.env.state_dim)
+        check_states(states, len(self.values), self.env.state_dim)
         return each(states, lambda s: self.values[s][rows_of(self.env, states[s])])

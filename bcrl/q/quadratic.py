@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bcrl.common.arrays import writable
 from bcrl.common.compiling import kept
 from bcrl.common.serialization import storable
-from bcrl.q.functions import Values, check_width
+from bcrl.q.functions import Values, check_states
 
 #: products: all z_i z_j, i ≤ j [released]; linear_quadratic: the z_i besides [paper].
 FEATURES = ("products", "linear_quadratic")
@@ -57,7 +57,7 @@ class Quadratic:
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         parts = self._parts
-        check_width(states, len(parts[0][0]))
+        check_states(states, len(parts[0]), len(parts[0][0]))
         if isinstance(states, np.ndarray):
             return _values(writable(states), *parts)
         return [

@@ -72,6 +72,11 @@ def test_a_batch_steps_as_its_lanes_do(env):
             alone = env.step(*(x[lane] for x in given))
             for many, one in zip(together, alone, strict=True):
                 assert many[lane].tobytes() == one.tobytes()
+        each = np.arange(env.n_actions)  # of every action at each state
+        spread = env.step(state[..., None, :], each, given[2][..., None, :])
+        for many, one in zip(spread, together, strict=True):
+            chosen = [many[lane][action[lane]] for lane in np.ndindex(6, 7)]
+            assert np.array_equal(chosen, one.reshape(42, *one.shape[2:]))
         state = together[0]
 
 

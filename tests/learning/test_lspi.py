@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg
 
 from bcrl.envs.linear_system import LinearSystem
-from bcrl.errors import ConfigError
+from bcrl.errors import BcrlError, ConfigError
 from bcrl.evaluation.step_metrics import evaluate
 from bcrl.learning import lspi
 from bcrl.learning.lspi import LSPI, improved, lstdq
@@ -92,6 +92,9 @@ def test_quadratic_values_are_weights_times_features(kind):
         expected = sum(w * f for w, f in zip(theta[s], phi(z, kind), strict=True))
         assert stacked[s, i, a] == pytest.approx(expected, rel=1e-10, abs=1e-10)
         assert listed[s][i, a] == pytest.approx(expected, rel=1e-10, abs=1e-10)
+    for wrong in (states[..., :3], states[:2], [*states, states[0]]):
+        with pytest.raises(BcrlError, match=r"4 entries.* 3;|3 seeds.* [24];"):
+            q(wrong, 8)
 
 
 @pytest.mark.parametrize("kind", FEATURES)

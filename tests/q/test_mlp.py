@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 from torch.nn import functional
 
 from bcrl.common.seeding import stream
+from bcrl.errors import BcrlError
 from bcrl.learning.replay import Replay, batched, one_by_one
 from bcrl.q.networks import cpu
 from bcrl.q.networks.mlp import Adam, DeepQ, Networks, xavier
@@ -244,6 +245,9 @@ def test_a_deep_q_answers_stacked_and_listed_states_alike():
     assert stacked.dtype == np.float64 and stacked.shape == (2, 9, A)
     for one, other in zip((stacked[0], stacked[1, :4]), listed, strict=True):
         assert np.allclose(one, other, atol=1e-6)
+    for wrong in (states[..., :3], states[:1], [*states, states[0]]):
+        with pytest.raises(BcrlError, match=r"4 entries.* 3;|2 seeds.* [13];"):
+            deep(wrong, A)
 
 
 def test_a_clone_trains_on_its_own():

@@ -123,15 +123,19 @@ def _cells(state: Floats) -> tuple[Integers, ...]:
 
 def reference(env: CarOnHill) -> tuple[Floats, Floats]:
     """The grid of evaluation states (n, 2), and Q* = sign(k) γ^(|k| − 1) (n, 2)."""
-    steps = signed_steps(env)
-    return env.evaluation_states(), np.sign(steps) * env.gamma ** (abs(steps) - 1)
+    return env.evaluation_states(), _values(env, signed_steps(env))
+
+
+def _values(env: CarOnHill, steps: Integers) -> Floats:
+    """Q* of signed steps."""
+    return np.sign(steps) * env.gamma ** (abs(steps) - 1)
 
 
 def table(env: CarOnHill) -> Iterator[str]:
     """CSV lines, actions (as forces) outermost, then the grid position-major."""
     yield "position,velocity,action,signed_steps,q"
-    states, values = reference(env)
-    actions = zip((-FORCE, FORCE), signed_steps(env).T, values.T, strict=True)
-    for force, steps, qs in actions:
-        for (p, v), k, q in zip(states, steps, qs, strict=True):
+    states, steps = env.evaluation_states(), signed_steps(env)
+    actions = zip((-FORCE, FORCE), steps.T, _values(env, steps).T, strict=True)
+    for force, ks, qs in actions:
+        for (p, v), k, q in zip(states, ks, qs, strict=True):
             yield f"{p:.17g},{v:.17g},{force:g},{k},{q:.17g}"

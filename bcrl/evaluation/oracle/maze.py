@@ -46,5 +46,6 @@ def reference(env: Maze) -> tuple[Floats, Floats]:
 def table(env: Maze) -> Iterator[str]:
     """CSV lines `x,y,action,q`, states outermost."""
     yield "x,y,action,q"
-    for (x, y), values in zip(*map(np.ndarray.tolist, reference(env)), strict=True):
+    states, q_star = reference(env)
+    for (x, y), values in zip(states.tolist(), q_star.tolist(), strict=True):
         yield from (f"{x},{y},{action},{q}" for action, q in enumerate(values))

@@ -15,23 +15,22 @@ import torch
 from numpy.typing import NDArray
 
 from bcrl.common.serialization import DERIVED, storable
-from bcrl.q.functions import Values, check_width
+from bcrl.q.functions import Values, check_states
 from bcrl.q.networks import cpu
 
 Tensor = torch.Tensor
 
 
-def xavier(
-    rng: np.random.Generator, sizes: Sequence[int], gain: float = math.sqrt(2)
-) -> NDArray[np.float32]:
+def xavier(rng: np.random.Generator, sizes: Sequence[int]) -> NDArray[np.float32]:
     """One network's weights and biases as a flat vector (P,), layer after layer.
 
-    Weights (in, out) are Xavier-uniform with `gain` (1 in the last layer), biases
+    Weights (in, out) are Xavier-uniform with gain √2 (1 in the last layer), biases
     uniform on ±1/√in (Glorot and Bengio 2010; torch's default for biases).
     """
     parts, last = [], len(sizes) - 2
     for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
-        limit = (gain if layer < last else 1.0) * math.sqrt(6.0 / (n_in + n_out))
+        gain = math.sqrt(2.0) if layer < last else 1.0
+        limit = gain * math.sqrt(6.0 / (n_in + n_out))
         parts.append(rng.uniform(-limit, limit, n_in * n_out))
         parts.append(rng.uniform(-1.0, 1.0, n_out) / math.sqrt(n_in))
     return np.concatenate(parts).astype(np.float32)
@@ -133,7 +132,7 @@ class DeepQ:
     steps: int = 0  # environment steps since the networks were new
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        check_width(states, self.online.sizes[0])
+        check_states(states, len(self.online.flat), self.online.sizes[0])
         if isinstance(states, np.ndarray):
             return self._values(self.online, states)
         one = [Networks(self.online.sizes, row) for row in self.online.flat.split(1)]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.common import plugins
-from bcrl.errors import ConfigError, did_you_mean
+from bcrl.common.checks import one_of
 from bcrl.q.forest import forest
 from bcrl.q.regressors.base import Fit, Problem
 from bcrl.q.regressors.scikit import Sklearn, SklearnForest, TreeKeys
@@ -72,6 +72,5 @@ def regressor_class(name: str) -> type:
     key = "algorithm.regressor.name"
     if "." in name:
         return plugins.component(key, name, name)
-    if name not in REGRESSORS:
-        raise ConfigError(key, name, did_you_mean(name, REGRESSORS))
+    one_of(key, name, REGRESSORS)
     return REGRESSORS[name]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from bcrl.common.checks import one_of
 from bcrl.errors import ConfigError, at_least, did_you_mean
 from bcrl.q.regressors.base import Fit, Problem
 
@@ -75,11 +76,11 @@ class Sklearn(_Fitting):
         from sklearn.pipeline import make_pipeline
         from sklearn.preprocessing import StandardScaler
 
-        made, classes = self.estimator, _regressors()
-        if isinstance(made, str) and made not in classes:
-            place = "algorithm.regressor.estimator"
-            raise ConfigError(place, made, did_you_mean(made, classes))
-        made = classes[made]() if isinstance(made, str) else clone(made)
+        if isinstance(self.estimator, str):
+            one_of("algorithm.regressor.estimator", self.estimator, _regressors())
+            made = _regressors()[self.estimator]()
+        else:
+            made = clone(self.estimator)
         known, arguments = made.get_params(), self.arguments or {}
         for key, value in arguments.items():
             if key not in known:
