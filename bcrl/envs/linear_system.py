@@ -147,14 +147,12 @@ class LinearSystem:
 
 def _rows(*arrays: Floats) -> tuple[tuple[int, ...], list[Floats]]:
     """The arrays' common leading axes, and each array as rows (n, k) over them."""
-    leads = [array.shape[:-1] for array in map(np.asarray, arrays)]
-    lead, rows = leads[0], []
-    if leads.count(lead) < len(leads):  # rare, and broadcasting costs more than a step
+    leads = [array.shape[:-1] for array in arrays]
+    lead = leads[0]
+    if leads.count(lead) < len(leads):  # rare; it takes longer than a step
         lead = np.broadcast_shapes(*leads)
         arrays = tuple(np.broadcast_to(a, (*lead, a.shape[-1])) for a in arrays)
-    for array in arrays:
-        rows.append(writable(array).reshape(-1, array.shape[-1]))
-    return lead, rows
+    return lead, [writable(a).reshape(-1, a.shape[-1]) for a in arrays]
 
 
 @kept(nogil=True)

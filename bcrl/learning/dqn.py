@@ -1,5 +1,6 @@
 """Deep Q-network (Mnih et al. 2015) for S seeds in lockstep, plain or boosted."""
 
+import copy
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -108,7 +109,7 @@ class DQNTrainer:
         stage: Stage,
         start: StageInit,
         batch: SeedBatch,
-        state: Any = None,
+        state: Any,
     ) -> None:
         self.settings, self.stage = settings, stage
         self.start, self.batch = start, batch
@@ -130,7 +131,7 @@ class DQNTrainer:
         lanes = lanes_of(env)
         env_state = lanes.begin(env.initial(noise))
         if isinstance(self.start.initial, DeepQ):
-            deep = self.start.initial.clone()
+            deep = copy.deepcopy(self.start.initial)
         else:
             sizes = (env.state_dim, *settings.hidden, env.n_actions)
             drawn = [xavier(stream(s, "weights", number), sizes) for s in seeds]

@@ -253,7 +253,7 @@ def test_a_deep_q_answers_stacked_and_listed_states_alike():
 def test_a_clone_trains_on_its_own():
     deep, replay = learner((16,), (0, 1)), filled((0, 1))
     losses_of(one_by_one(deep, replay), indices((0, 1), 1)[0])
-    copy = deep.clone()
+    copy = deepcopy(deep)
     kept = deepcopy((deep.online.flat, deep.target.flat, deep.optimiser.moments))
     assert torch.equal(copy.optimiser.moments, kept[2]) and copy.optimiser.steps == 1
     losses_of(one_by_one(copy, replay), indices((0, 1), 1)[0])

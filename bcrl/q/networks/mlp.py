@@ -4,7 +4,6 @@ It runs on any device. On a CPU, the module `cpu` computes the same faster, in c
 code; `DeepQ` and the DQN update choose by the device of the parameters.
 """
 
-import copy
 import itertools
 import math
 from collections.abc import Sequence
@@ -147,7 +146,3 @@ class DeepQ:
             return cpu.outputs(flat.numpy(), sizes, inputs).astype(np.float64)
         values = networks.forward(torch.from_numpy(inputs).to(flat.device))
         return values.cpu().numpy().astype(np.float64)
-
-    def clone(self) -> "DeepQ":
-        """A copy that may be trained on without changing this one."""
-        return copy.deepcopy(self)
