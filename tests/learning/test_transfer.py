@@ -1,4 +1,4 @@
-"""What each transfer does to targets, rewards and actions, by hand."""
+"""What each transfer does to rewards, actions and networks, by hand."""
 
 import math
 from dataclasses import replace
@@ -11,53 +11,16 @@ from bcrl.api import Boost, PolicyReuse, ResidualPolicy, Shape, warm_start
 from bcrl.common.seeding import stream
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.errors import ConfigError
-from bcrl.evaluation.oracle.maze import optimal_q
-from bcrl.learning.bellman import precompute_target, residual_target, shaping
 from bcrl.learning.dqn import CHOICES, DQN, DRAW_BLOCK, DQNTrainer
 from bcrl.learning.policies import combined_actions
-from bcrl.learning.rollout import transition_tables
 from bcrl.learning.transfer import StageInit, StageResult, begin
-from bcrl.q.functions import ZERO, Shaped, Sum, Table
-from tests.toys import Corridor, last, staged, team
+from bcrl.q.functions import ZERO, Sum
+from tests.toys import last, staged, team
 
 TARGET = LinearSystem()
 RELEASED_BOOST = Boost("residual", "two", False)
 RELEASED_SHAPE = Shape("before_reset", False)
 SMALL = DQN(hidden=(16,), random_steps=0, steps=100, learning_starts=1000)
-
-# Three transitions, the second absorbing; γ = 0.9.
-REWARD = np.array([-1.0, 0.0, 2.0])
-ABSORBING = np.array([False, True, False])
-NEXT_BASE = np.array([[1.0, 3.0], [2.0, 5.0], [-4.0, -1.0]])
-NEXT_RESIDUAL = np.array([[2.0, -1.0], [1.0, 1.0], [0.0, 3.0]])
-BASE = np.array([0.5, 0.25, -2.0])
-
-
-def target(base, next_base, boost):
-    known = (REWARD, ABSORBING, next_base, base, 0.9, boost)
-    inside, fixed, discount = precompute_target(*known)
-    return fixed + discount * (NEXT_RESIDUAL + inside).max(-1)
-
-
-@pytest.mark.parametrize(
-    ("boost", "expected"),
-    [
-        # max of the sum: 3, –, 2; sum of the maxima: 2 + 3, –, 3 − 1
-        (Boost(), [-1 + 2.7 - 0.5, -0.25, 2 + 1.8 + 2]),
-        (Boost(greedy_on="residual"), [1.2, -0.25, 5.8]),
-        (Boost(maxima="two"), [-1 + 4.5 - 0.5, -0.25, 5.8]),
-        (Boost(mask_at_goal=False), [1.2, 4.5 - 0.25, 5.8]),
-        (RELEASED_BOOST, [3.0, 4.25, 5.8]),
-    ],
-)
-def test_the_target_of_each_boost_by_hand(boost, expected):
-    assert target(BASE, NEXT_BASE, boost).tolist() == pytest.approx(expected)
-    plain = target(np.zeros(3), np.zeros((3, 2)), boost)
-    assert plain.tolist() == pytest.approx([-1 + 1.8, 0.0, 2 + 2.7])
-    if boost == Boost():
-        whole = NEXT_BASE + NEXT_RESIDUAL
-        equation_5 = residual_target(REWARD, ABSORBING, whole, BASE, 0.9)
-        assert np.allclose(target(BASE, NEXT_BASE, boost), equation_5)
 
 
 class Known:
@@ -75,8 +38,8 @@ def value(state):
     return 7.0 * state[0] + 3.0 * state[2] + 40.0
 
 
-def run_of(start, settings=SMALL, env=TARGET, seeds=(0,), number=2):
-    return DQNTrainer(settings, staged(settings, env, number), start, team(*seeds))
+def run_of(start, settings=SMALL, env=TARGET, seeds=(0,)):
+    return DQNTrainer(settings, staged(settings, env, 2), start, team(*seeds))
 
 
 def stored(run, at=0):
@@ -150,26 +113,6 @@ def test_the_horizons_end_is_bootstrapped_from_and_starts_anew():
     u = stream(0, "exploration", 2, 0).random((DRAW_BLOCK, CHOICES + 12))[2]
     fresh = TARGET.initial(u[CHOICES + 8 :])
     assert np.allclose(stored(run, 3)["state"], fresh, atol=1e-6)
-
-
-def by_brute_force(actions, prior, own):
-    x, y = (a + b for a, b in zip(actions[prior], actions[own], strict=True))
-    if math.hypot(x, y) < 1e-6:
-        return own
-
-    def distance(a, to):
-        return round(math.hypot(a[0] - to[0], a[1] - to[1]), 6)
-
-    rank = [(distance(a, (x, y)), distance(a, actions[own])) for a in actions]
-    assert rank.count(min(rank)) == 1  # both rules together leave no choice
-    return rank.index(min(rank))
-
-
-def test_the_residual_policys_table_is_a_brute_force_searchs():
-    actions = TARGET.actions.tolist()
-    table = combined_actions(TARGET.actions)
-    for prior, own in np.ndindex(8, 8):
-        assert table[prior, own] == by_brute_force(actions, prior, own)
 
 
 @pytest.mark.parametrize("epsilon", [0.0, 0.3, 1.0])
@@ -314,50 +257,4 @@ def test_a_boosted_stage_starts_with_new_networks_on_a_frozen_sum():
     deep = run.state.deep
     assert not torch.equal(deep.online.flat, first.residual.online.flat)
     assert (deep.steps, deep.optimiser.steps) == (0, 0)
-    q = run.snapshot().result.q
-    assert isinstance(q, Sum) and q.terms == (first.q, deep)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_shaping_shifts_q_by_minus_v_and_keeps_the_greedy_policy(seed):
-    env = Corridor(prize=2.0)
-    index, reward, absorbing = transition_tables(env)
-    v = np.random.default_rng(seed).standard_normal(6) * 5.0
-    extra = shaping(np.repeat(v[:, None], 2, 1), v[index], absorbing, env.gamma, True)
-    plain = optimal_q(index, reward, absorbing, env.gamma)
-    shaped = optimal_q(index, reward + extra, absorbing, env.gamma)
-    assert np.allclose(shaped, plain - v[:, None], atol=1e-9)
-    assert np.array_equal(shaped.argmax(1), plain.argmax(1))
-    tables = (Table([t], env) for t in (shaped, np.repeat(v[:, None], 2, 1)))
-    assert np.allclose(Shaped(ZERO, *tables)([env.states()], 2)[0], plain, atol=1e-9)
-
-
-class Counting:
-    """A Q-function that counts the states that it is queried at."""
-
-    queried = 0
-
-    def __call__(self, states, n_actions):
-        self.queried += sum(map(len, states))
-        return [np.repeat(x[:, :1] + 1.0, n_actions, 1) for x in states]
-
-
-def test_stages_stacked_with_shaping_and_boosting_are_queried_once_each():
-    first, states = Counting(), [np.zeros((3, 1))]
-    q = first
-    for _ in range(10):
-        q = Shaped(q, ZERO, q)
-    assert (q(states, 2)[0] == 2.0**10).all() and first.queried == 3
-
-
-@pytest.mark.parametrize("stacked", [True, False])
-def test_a_memoized_q_is_the_same_q_queried_once_per_state(stacked):
-    q = Counting()
-    start = StageInit(base=q).memoized()
-    assert start.potential is ZERO and StageInit().memoized() == StageInit()
-    states = np.random.default_rng(0).normal(size=(2, 4, 3))
-    for rows in (slice(0, 2), slice(1, 4), slice(0, 0), slice(0, 4)):
-        now = states[:, rows] if stacked else [x[rows] for x in states]
-        for x, values in zip(now, start.base(now, 2), strict=True):
-            assert values.shape == (len(x), 2) and (values == x[:, :1] + 1).all()
-    assert q.queried == 8  # four states of either seed
+    assert run.snapshot().result.q == Sum((first.q, deep))
