@@ -1,6 +1,7 @@
 """What each transfer does to rewards, actions and networks, by hand."""
 
 import math
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -229,7 +230,7 @@ def test_a_warm_start_continues_with_all_but_the_replay():
     settings = replace(SMALL, steps=90, learning_starts=20, target_update=25)
     first = staged(settings, LinearSystem("lq", horizon=100))
     result = last(settings.learn(first, StageInit(), team(0, 1))).result
-    old = result.residual.clone()
+    old = deepcopy(result.residual)
     assert old.steps == 90 and old.optimiser.steps == 70
     assert not torch.equal(old.online.flat, old.target.flat)
     run = run_of(begin([warm_start], result), settings, seeds=(0, 1))
