@@ -69,8 +69,7 @@ def test_q_mean_is_that_of_the_first_observations():
         for n_in, n_out in itertools.pairwise((2, 9, 6, 3)):
             weights = flat[at : at + n_in * n_out].reshape(n_in, n_out)
             at += n_in * n_out + n_out
-            x = np.maximum(x, 0) if n_in != 2 else x
-            x = x @ weights + flat[at - n_out : at]
+            x = (np.maximum(x, 0) if n_in != 2 else x) @ weights + flat[at - n_out : at]
         found = evaluate(now, team.seeds)[0][1]["q_mean"]
         assert found == pytest.approx(x.max(-1).mean(), rel=1e-5)
 

@@ -37,7 +37,7 @@ def learn(settings, start=None, env=TARGET, seeds=(0,), number=1):
 
 def trainer(settings, start=None, env=TARGET, seeds=(0,)):
     stage = staged(settings, env)
-    return DQNTrainer(settings, stage, start or StageInit(), team(*seeds))
+    return DQNTrainer(settings, stage, start or StageInit(), team(*seeds), None)
 
 
 def weights(snapshot):

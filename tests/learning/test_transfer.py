@@ -40,7 +40,7 @@ def value(state):
 
 
 def run_of(start, settings=SMALL, env=TARGET, seeds=(0,)):
-    return DQNTrainer(settings, staged(settings, env, 2), start, team(*seeds))
+    return DQNTrainer(settings, staged(settings, env, 2), start, team(*seeds), None)
 
 
 def stored(run, at=0):
