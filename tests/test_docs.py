@@ -42,8 +42,8 @@ slow = {line: [pytest.mark.slow] * bool(re.search(SLOW, line)) for line in COMMA
 @pytest.mark.parametrize("line", [pytest.param(x, marks=slow[x]) for x in COMMANDS])
 def test_every_command_would_run(line, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = shlex.split(line)[1:]
-    arguments = flags.flag_parser().parse_intermixed_args(words)
+    monkeypatch.setattr("sys.argv", shlex.split(line))
+    arguments = flags.arguments()
     if not arguments.status:
         assert "nothing was run" in status.dry_run(jobs.plans(arguments))
 
