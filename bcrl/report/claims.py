@@ -77,7 +77,8 @@ MEASURES = {
 }
 _STATISTICS = {"deviation of return": np.std}  # of others the mean over seeds
 
-_DATA = yaml.safe_load(Path(__file__).with_name("claims.yaml").read_text("utf-8"))
+_TEXT = Path(__file__).with_name("claims.yaml").read_text("utf-8")
+_DATA = yaml.safe_load(_TEXT.format(optimal=_OPTIMAL, near=_NEAR))
 _TITLES: dict[str, str] = _DATA["titles"]  # by environment
 #: Environment, family → statement → quantity, what is expected of it, and of whom.
 CLAIMS: dict[tuple[str, ...], dict[str, list[str]]] = {
@@ -85,21 +86,19 @@ CLAIMS: dict[tuple[str, ...], dict[str, list[str]]] = {
 }
 
 
-def claims_report(runs: Runs, tag: str | None = None) -> str:
-    """The Markdown document: per environment the claims and the values behind them."""
-    tagged = f", variants @{tag}" if tag else ""
-    notes = runs.notes_on(tag)
-    parts = [f"# The paper's claims, scale {runs.scale}{tagged}\n"]
+def claims_report(runs: Runs, tag: str | None, claims: Iterable[Section]) -> str:
+    """The Markdown document of the `claims_sections` and the notes on the runs."""
+    tagged, notes = f", variants @{tag}" if tag else "", runs.notes_on(tag)
+    parts: list[object] = [f"# The paper's claims, scale {runs.scale}{tagged}\n"]
     if lacking := incomplete(notes):
         parts.append(f"**{lacking}**\n")
-    sections = claims_sections(runs, tag).values()
-    parts += [PARAGRAPHS["claims"], PARAGRAPHS["glossary"], *map(str, sections)]
-    if notes:
-        parts += ["## Notes on the runs\n", *(f"- {note.text}" for note in notes), ""]
-    return "\n".join(parts)
+    parts += [PARAGRAPHS["claims"], PARAGRAPHS["glossary"], *claims]
+    return "\n".join(map(str, [*parts, *tables.notes_section(notes)]))
 
 
-def claims_sections(runs: Runs, tag: str | None) -> dict[tuple[str, str], Section]:
+def claims_sections(
+    runs: Runs, tag: str | None = None
+) -> dict[tuple[str, str], Section]:
     """(environment, family) of the paper's → its claims and the values behind them."""
     found = {}
     for (env, family), claims in CLAIMS.items():
@@ -117,7 +116,7 @@ def claims_sections(runs: Runs, tag: str | None) -> dict[tuple[str, str], Sectio
         counted = ", ".join(f"{n} {verdict}" for verdict, n in verdicts.most_common())
         seconds = sum(variant.cpu_seconds for variant in variants)
         parts += [f"{len(rows)} claims: {counted}.\n", TextTable(rows)]
-        parts += _values(variants)
+        parts += _values(variants, family)
         parts.append(f"CPU time of these runs: {tables.duration(seconds)}.\n")
         found[env, family] = Section(_TITLES[env], parts)
     return found
@@ -181,7 +180,7 @@ def verdict(value: float, interval: Interval, expect: str, seeds: int) -> str:
     return "holds" if holds else "does not hold" if fails else "undecided"
 
 
-def _values(variants: Iterable[Variant]) -> list[str | TextTable]:
+def _values(variants: Iterable[Variant], family: str) -> list[str | TextTable]:
     """What every method reaches, and metrics of FQI at every stage's end."""
     common = set.intersection(*(set(v.metrics) for v in variants))
     rows = []
@@ -199,7 +198,7 @@ def _values(variants: Iterable[Variant]) -> list[str | TextTable]:
             low, high = map(number, statistics.share_interval(hits, n))
             row["seeds solving the target"] = f"{hits}/{n} [{low}, {high}]"
         rows.append(row)
-    parts: list[str | TextTable] = [PARAGRAPHS[variant.family], TextTable(rows)]
+    parts: list[str | TextTable] = [PARAGRAPHS[family], TextTable(rows)]
     columns = [f"stage {k + 1}" for k in range(max(v.stage[-1] for v in variants))]
     for metric in (name for name in _AT_ENDS if name in common):
         rows = []

@@ -2,7 +2,8 @@
 
 import inspect
 import sys
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -11,12 +12,12 @@ from matplotlib.figure import Figure
 from bcrl.common.files import make_directory, write_text
 from bcrl.common.terminal import ready, say, show
 from bcrl.errors import BcrlError
+from bcrl.report import tables
 from bcrl.report.animation import animations, gif_of
-from bcrl.report.claims import claims_report
+from bcrl.report.claims import claims_report, claims_sections
 from bcrl.report.figures import curves, linear, maze, style
 from bcrl.report.load import load_runs
 from bcrl.report.page import page
-from bcrl.report.tables import PARAGRAPHS, aggregate, sweep_sections, sweep_table
 from bcrl.report.variants import COMPARED, LINEAR, Runs, env_title
 from bcrl.results.arguments import ResultsParser
 
@@ -53,12 +54,12 @@ def _parser() -> ResultsParser:
 
 
 def report(
-    runs: Runs, out: Path, figures: Sequence[str], tag: str | None
+    runs: Runs, out: Path, figures: Collection[str], tag: str | None
 ) -> tuple[list[Path], list[str]]:
     """Write these figures and all documents: the files, what was skipped and why."""
     suffix = f"{runs.scale}@{tag}" if tag else runs.scale
     files: list[Path] = []
-    skipped, drawn = [], {}
+    skipped, drawn = [], defaultdict(list)
 
     def save(name: str, title: str, draw: Callable[..., Figure], *of: object) -> Path:
         """The PNG of a figure that was drawn and saved."""
@@ -67,14 +68,16 @@ def report(
         files.extend(saved)
         return saved[0]
 
-    for name in (name for name in figures if name != CURVES):
+    for name in figures:
+        if name == CURVES:
+            continue
         pair, experiment, needed, draw = FIGURES[name]
         methods = runs.compared(pair[0], tag, pair[1])
         if methods and (not needed or needed in methods):
             title = f"Klink et al. (2022), figure {name}, reproduced: {suffix}"
             image = save(f"figure_{name}_{suffix}", title, draw, runs, tag)
             caption = f"Figure {name}. {inspect.getdoc(draw).splitlines()[0]}"
-            drawn.setdefault(pair, []).append((image, caption))
+            drawn[pair].append((image, caption))
             continue
         lacking = f"{pair[0]}/{needed or '*'}{f'@{tag}' if tag else ''}"
         which = {None: "", "released": "_released"}.get(tag, f" tag={tag}")
@@ -87,10 +90,10 @@ def report(
         for each in [tag] if tag in tags else tags if tag is None else ():
             place = f"{runs.scale}@{each}" if each else runs.scale
             title = f"{env}, {family}: learning curves, {place}"
-            of = (curves.figure_curves, runs, env, family, each)
+            of = curves.figure_curves, runs, env, family, each
             image = save(f"curves_{env}_{family}_{place}", title, *of)
-            picture = image, "Mean over seeds with 95 % intervals."
-            drawn.setdefault((env, family), []).append(picture)
+            caption = "Mean over seeds with 95 % intervals."
+            drawn[env, family].append((image, caption))
 
     def write(name: str, text: str | pd.DataFrame) -> None:
         if isinstance(text, pd.DataFrame):
@@ -98,21 +101,28 @@ def report(
         files.append(write_text(out / name, text))
 
     for family, stem in (("FQI", "aggregate"), ("DQN", "aggregate_dqn")):
-        if family in {family for _, family in runs.pairs}:
-            write(f"{stem}_{runs.scale}.csv", aggregate(runs, family))
-    write(f"claims_{suffix}.md", claims_report(runs, tag))
-    compared = sweep_table(runs)
-    if sweeps := sweep_sections(compared):
+        if any(variant.family == family for variant in runs.variants):
+            write(f"{stem}_{runs.scale}.csv", tables.aggregate(runs, family))
+    claims, compared = claims_sections(runs, tag), tables.sweep_table(runs)
+    write(f"claims_{suffix}.md", claims_report(runs, tag, claims.values()))
+    if sweeps := tables.sweep_sections(compared):
+        ours = compared.groupby(["env", "method"]).groups
+        notes = [note for note in runs.notes if (note.env, note.method) in ours]
         title = f"# Variants compared, scale {runs.scale}\n"
-        parts = [title, PARAGRAPHS["sweeps"], *map(str, sweeps)]
-        write(f"sweep_{runs.scale}.md", "\n".join(parts))
+        parts = [
+            title,
+            tables.PARAGRAPHS["sweeps"],
+            *sweeps,
+            *tables.notes_section(notes),
+        ]
+        write(f"sweep_{runs.scale}.md", "\n".join(map(str, parts)))
         write(f"sweep_{runs.scale}.csv", compared)
     agents = [
         (path, f"{env_title(variant.env)}: {variant.name}")
         for variant in runs.variants
         if tag in (None, variant.tag) and (path := gif_of(runs, variant, out)).exists()
     ]
-    write(f"report_{suffix}.html", page(runs, tag, drawn, agents, sweeps))
+    write(f"report_{suffix}.html", page(runs, tag, drawn, agents, claims, sweeps))
     return files, skipped
 
 
@@ -121,8 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ready()
     try:
         options = _parser().parsed(arguments)
-        chosen = dict.fromkeys(options.figures)
-        chosen = [*FIGURES, CURVES] if "all" in chosen else [*chosen]
+        chosen = [*FIGURES, CURVES] if "all" in options.figures else options.figures
         runs = load_runs(options.runs_dir, options.scale, options.allow_incomplete)
         for note in runs.notes:
             say(f"note: {note.text}")
@@ -131,12 +140,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         shown, not_shown = [], []
         if options.gif is not None:  # first: the page shows them
             shown, not_shown = animations(runs, out, options.tag, options.gif)
-        files, skipped = report(runs, out, chosen, options.tag)
+        files, skipped = report(runs, out, dict.fromkeys(chosen), options.tag)
     except BcrlError as error:
         say(f"bcrl-report: {error}")
         return 2
-    for line in skipped + not_shown if options.scale != "search" else ():
-        say(f"skipped {line}")
+    if options.scale != "search":
+        for line in skipped + not_shown:
+            say(f"skipped {line}")
     show("\n".join(map(str, files + shown)))
     return 0
 

@@ -2,7 +2,6 @@
 
 import base64
 import hashlib
-import json
 import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -13,8 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from bcrl import __version__
-from bcrl.common.identity import differences, flat, identity
-from bcrl.report.claims import claims_sections
+from bcrl.common.identity import as_text, differences, flat, identity
 from bcrl.report.curve_data import curve_data
 from bcrl.report.tables import ABSENT, PARAGRAPHS, Section, TextTable, duration, number
 from bcrl.report.variants import Runs, env_title, incomplete
@@ -29,11 +27,12 @@ def page(
     tag: str | None,
     figures: Mapping[Pair, Sequence[Picture]],
     agents: Sequence[Picture],
+    claims: Mapping[Pair, Section],
     sweeps: Sequence[Section],
 ) -> str:
     """The page of one scale's runs. `figures` that the paper doesn't have are for
     browsers that run no scripts; `agents` move."""
-    notes, claims = runs.notes_on(tag), claims_sections(runs, tag)
+    notes = runs.notes_on(tag)
     return _JINJA.get_template("page.html").render(
         {"version": __version__, "texts": PARAGRAPHS, "runs": runs, "tag": tag},
         notes=notes,
@@ -96,8 +95,8 @@ def configurations(runs: Runs) -> list[dict[str, Any]]:
             config = variant.sidecars[0]["config"]
             settings, differing = flat(identity(config)), differences(config, other)
             settings |= {key: mine for key, (mine, _) in differing.items()}
-            theirs = {key: _text(value) for key, (_, value) in differing.items()}
-            lines = [(k, _text(v), theirs.get(k)) for k, v in settings.items()]
+            theirs = {key: as_text(value) for key, (_, value) in differing.items()}
+            lines = [(k, as_text(v), theirs.get(k)) for k, v in settings.items()]
             commands = dict.fromkeys(s.get("command") for s in variant.sidecars)
             differ = f", {len(differing)} differ" if differing else ""
             about = {"name": variant.name, "summary": f"{len(lines)} settings{differ}"}
@@ -106,10 +105,6 @@ def configurations(runs: Runs) -> list[dict[str, Any]]:
         title = f"{env_title(env)}, {family}"
         groups.append({"title": title, "reference": reference.name, "variants": found})
     return groups
-
-
-def _text(value: object) -> str:
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
 def seed_origins(runs: Runs) -> list[str | TextTable]:

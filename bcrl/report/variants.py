@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from bcrl.common.divergence import diverging
 from bcrl.results.layout import seed_path, spelled
 from bcrl.results.read import read_arrays
 
@@ -47,7 +48,8 @@ class Variant:
     """All complete seeds of one variant: S seeds, I rows (evaluations) common to them.
     `stage` and `task` (I,) are 1-based; `index` (I,) counts the iterations or, in the
     DQN family, the environment steps of all stages so far; `metrics` are (S, I);
-    `sidecars` are the seeds' JSONs; `failed` are seeds that diverged and are left out.
+    `sidecars` are the seeds' JSONs; `failed` are seeds that diverged and are left out;
+    `far` are the metrics that diverge, and their largest magnitudes.
     The folder's `name` is the `method` and perhaps its `tag`: `BC-FQI@released`."""
 
     folder: Path
@@ -64,6 +66,7 @@ class Variant:
         self.env, self.name = self.folder.parts[-2:]
         self.method, _, tag = self.name.partition("@")
         self.tag = tag or None
+        self.far = diverging(self.metrics)
 
     @property
     def optimum(self) -> float | None:

@@ -18,7 +18,6 @@ _WORST = -150.0  # target return of a policy that never succeeds: −1 in 150 st
 _APART = 0.18  # share of the axis below which neighbouring labels take two rows
 _EVERY = 4  # grid points per arrow
 _SMALL = style.SMALL | {"fontsize": 6.5}
-NO_RUNS = {"ha": "center", "va": "center", "color": "0.5"}
 
 
 def _pretraining_rows(variant: Variant) -> np.ndarray:
@@ -72,7 +71,7 @@ def _draw_pretraining(axes: Axes, methods: Methods) -> None:
     if handles:
         axes.legend(handles=handles, loc="lower right", fontsize=7)
     else:
-        axes.text(0.5, 0.5, "no pretraining", transform=axes.transAxes, **NO_RUNS)
+        axes.text(0.5, 0.5, "no pretraining", transform=axes.transAxes, **style.EMPTY)
     axes.set_ylabel("discounted return in the LQ task")
     axes.set_title("pretraining", pad=3)
 
@@ -109,7 +108,7 @@ def _draw_prior(axes: Axes, learner: str, variant: Variant | None) -> None:
     if variant is None:
         axes.set_title(title, pad=4)
         axes.set(xlim=(-5, 5), ylim=(-5, 5))
-        axes.text(0, 0, "no runs", **NO_RUNS)
+        axes.text(0, 0, "no runs", **style.EMPTY)
         return
     wished = _SHOWN_SEED[learner]
     seed = wished if wished in variant.seeds else min(variant.seeds)

@@ -34,6 +34,7 @@ COLOURS = {
 _BANDS = ("#EBEBEB", "#F8F8F8")
 OPTIMUM = {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 1.0}
 SMALL = {"color": "0.35", "textcoords": "offset points"}  # labels beside what they name
+EMPTY = {"color": "0.5", "ha": "center", "va": "center"}  # words on empty axes
 
 _DPI = 150
 TEXT_WIDTH = 7.2  # inches, a full text width
