@@ -96,9 +96,7 @@ def claims_report(runs: Runs, tag: str | None, claims: Iterable[Section]) -> str
     return "\n".join(map(str, [*parts, *tables.notes_section(notes)]))
 
 
-def claims_sections(
-    runs: Runs, tag: str | None = None
-) -> dict[tuple[str, str], Section]:
+def claims_sections(runs: Runs, tag: str | None) -> dict[tuple[str, str], Section]:
     """(environment, family) of the paper's → its claims and the values behind them."""
     found = {}
     for (env, family), claims in CLAIMS.items():
@@ -107,17 +105,15 @@ def claims_sections(
             found[env, family] = Section(_TITLES[env], ["No runs.\n"])
             continue
         variants = methods.values()
-        parts: list[str | TextTable] = []
-        if len({variant.tag for variant in variants}) > 1:
-            parts.append(f"{tags_shown(methods)}; the others are untagged.\n")
         rows = [_judged(text, claim, methods) for text, claim in claims.items()]
         # Reasons are left aside.
         verdicts = Counter(re.split(r" \(|:", row["verdict"])[0] for row in rows)
         counted = ", ".join(f"{n} {verdict}" for verdict, n in verdicts.most_common())
-        seconds = sum(variant.cpu_seconds for variant in variants)
-        parts += [f"{len(rows)} claims: {counted}.\n", TextTable(rows)]
-        parts += _values(variants, family)
-        parts.append(f"CPU time of these runs: {tables.duration(seconds)}.\n")
+        parts = [f"{len(rows)} claims: {counted}.\n", TextTable(rows)]
+        if len({variant.tag for variant in variants}) > 1:
+            parts.insert(0, f"{tags_shown(methods)}; the others are untagged.\n")
+        seconds = tables.duration(sum(variant.cpu_seconds for variant in variants))
+        parts += [*_values(variants, family), f"CPU time of these runs: {seconds}.\n"]
         found[env, family] = Section(_TITLES[env], parts)
     return found
 
@@ -199,15 +195,13 @@ def _values(variants: Iterable[Variant], family: str) -> list[str | TextTable]:
             row["seeds solving the target"] = f"{hits}/{n} [{low}, {high}]"
         rows.append(row)
     parts: list[str | TextTable] = [PARAGRAPHS[family], TextTable(rows)]
-    columns = [f"stage {k + 1}" for k in range(max(v.stage[-1] for v in variants))]
+    stages = range(1, 1 + max(v.stage[-1] for v in variants))
     for metric in (name for name in _AT_ENDS if name in common):
         rows = []
-        for variant in variants:
-            row, values = {"method": variant.name}, variant.metrics[metric]
-            row |= dict.fromkeys(columns, ABSENT)
-            for at in np.flatnonzero(np.diff(variant.stage, append=0)):
-                row[f"stage {variant.stage[at]}"] = number(values[:, at].mean())
-            rows.append(row)
+        for v in variants:
+            ends = {n: number(_at(v, metric, n).mean()) for n in np.unique(v.stage)}
+            row = {f"stage {n}": ends.get(n, ABSENT) for n in stages}
+            rows.append({"method": v.name} | row)
         parts += [f"{_AT_ENDS[metric]} at every stage's end:\n", TextTable(rows)]
     return parts
 

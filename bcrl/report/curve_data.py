@@ -56,10 +56,9 @@ def _series(variant: Variant, metrics: list[str]) -> dict[str, Any]:
     drawn = {}
     for metric in (name for name in metrics if name in variant.metrics):
         values = variant.metrics[metric][:, rows]
-        low, high = bootstrap_curves(values)
-        q1, median, q3 = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
-        lines = {"low": low, "high": high, "median": median, "q1": q1, "q3": q3}
-        drawn[metric] = {name: _numbers(line) for name, line in lines.items()} | {
+        lines = *bootstrap_curves(values), *np.quantile(values, [0.25, 0.5, 0.75], 0)
+        named = zip(("low", "high", "q1", "median", "q3"), lines, strict=True)
+        drawn[metric] = {name: _numbers(line) for name, line in named} | {
             "mean": _numbers(values.mean(axis=0), 7),
             "seeds": [_numbers(seed) for seed in values[:_SEEDS]],
             "far": metric in variant.far,

@@ -35,9 +35,9 @@ def load_runs(runs_dir: Path, scale: str, allow_incomplete: bool = False) -> Run
     if not runs.variants:
         parts = [f"no complete runs under {runs_dir / scale}"]
         parts += [note.text for note in notes[:1]]
-        others = {p.parts[-4] for p in runs_dir.glob("*/*/*/seed_*.json")} - {scale}
-        if others:
-            parts.append(f"there are runs at scale {listed(sorted(others))}")
+        scales = {path.parts[-4] for path in runs_dir.glob("*/*/*/seed_*.json")}
+        if others := sorted(scales - {scale}):
+            parts.append(f"there are runs at scale {listed(others)}")
         command = shlex.join(["bcrl", "experiment=fig1", f"scale={scale}"])
         raise BcrlError("; ".join([*parts, f"`{command}` makes those of figure 1"]))
     for env, family in runs.pairs:
@@ -75,13 +75,10 @@ def _variant(checked: Checked, notes: list[Note]) -> Variant | None:
     if lacking := [name for name in needed if name not in first]:
         note(f"does not record {listed(lacking)}: left out")
         return None
-    metrics = {
-        str(name): np.stack([table[name].to_numpy() for table in tables.values()])
-        for name in first
-    }
+    values = np.stack([table.to_numpy().T for table in tables.values()], axis=1)
+    values[~np.isfinite(values)] = np.nan  # a gap, not a line to infinity
+    metrics = dict(zip(map(str, first), values, strict=True))
     rows = [metrics.pop(name)[0].astype(np.int64) for name in INDEX[family]]
-    for values in metrics.values():
-        values[~np.isfinite(values)] = np.nan  # a gap, not a line to infinity
     sidecars = tuple(documents[seed] for seed in tables)
     if len({json.dumps([s.get("git"), s.get("versions")]) for s in sidecars}) > 1:
         note("seeds of different revisions or versions (see the page's provenance)")

@@ -15,10 +15,9 @@ from bcrl import __version__
 from bcrl.common.identity import as_text, differences, flat, identity
 from bcrl.report.curve_data import curve_data
 from bcrl.report.tables import ABSENT, PARAGRAPHS, Section, TextTable, duration, number
-from bcrl.report.variants import Runs, env_title, incomplete
+from bcrl.report.variants import Pair, Runs, env_title, incomplete
 from bcrl.results.layout import seed_path, spelled
 
-Pair = tuple[str, str]  # environment and family
 Picture = tuple[Path, str]  # an image file and what it shows
 
 
@@ -33,15 +32,12 @@ def page(
     """The page of one scale's runs. `figures` that the paper doesn't have are for
     browsers that run no scripts; `agents` move."""
     notes = runs.notes_on(tag)
+    given = {"version": __version__, "texts": PARAGRAPHS, "runs": runs, "tag": tag}
+    given |= {"figures": figures, "claims": claims, "agents": agents, "sweeps": sweeps}
+    given |= {"notes": notes, "incomplete": incomplete(notes)}
     return _JINJA.get_template("page.html").render(
-        {"version": __version__, "texts": PARAGRAPHS, "runs": runs, "tag": tag},
-        notes=notes,
-        incomplete=incomplete(notes),
+        given,
         facts=_facts(runs, claims),
-        figures=figures,
-        claims=claims,
-        agents=agents,
-        sweeps=sweeps,
         costs=costs(runs),
         configs=configurations(runs),
         provenance=seed_origins(runs),
@@ -90,10 +86,10 @@ def configurations(runs: Runs) -> list[dict[str, Any]]:
     groups = []
     for env, family in runs.pairs:
         reference, *_ = ours = runs.of(env, family)
-        other, found = reference.sidecars[0]["config"], []
+        title, found = f"{env_title(env)}, {family}", []
         for variant in ours:
-            config = variant.sidecars[0]["config"]
-            settings, differing = flat(identity(config)), differences(config, other)
+            differing = differences(variant.config, reference.config)
+            settings = flat(identity(variant.config))
             settings |= {key: mine for key, (mine, _) in differing.items()}
             theirs = {key: as_text(value) for key, (_, value) in differing.items()}
             lines = [(k, as_text(v), theirs.get(k)) for k, v in settings.items()]
@@ -102,7 +98,6 @@ def configurations(runs: Runs) -> list[dict[str, Any]]:
             about = {"name": variant.name, "summary": f"{len(lines)} settings{differ}"}
             about |= {"command": "\n".join(filter(None, commands)), "lines": lines}
             found.append(about)
-        title = f"{env_title(env)}, {family}"
         groups.append({"title": title, "reference": reference.name, "variants": found})
     return groups
 

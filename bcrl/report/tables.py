@@ -96,7 +96,8 @@ def sweep_table(runs: Runs) -> pd.DataFrame:
         together.setdefault((variant.env, variant.method), []).append(variant)
     rows = []
     for variants in (group for group in together.values() if len(group) > 1):
-        texts = pd.DataFrame([_texts(variant) for variant in variants])
+        configs = [flat(identity(v.config) | {"scale": {}}) for v in variants]
+        texts = pd.DataFrame([{k: as_text(v) for k, v in c.items()} for c in configs])
         differing = texts.loc[:, texts.nunique(dropna=False) > 1].fillna(ABSENT)
         chosen = differing.T.to_dict().values()
         for variant, settings in zip(variants, chosen, strict=True):
@@ -114,12 +115,6 @@ def sweep_table(runs: Runs) -> pd.DataFrame:
         groups = decisive.groupby([table["env"], table["method"]])
         table["best"] = groups.rank(ascending=False, method="first") == 1
     return table
-
-
-def _texts(variant: Variant) -> dict[str, str]:
-    """Dotted keys of a variant's config, but for its scale → values as text."""
-    config = identity(variant.sidecars[0]["config"]) | {"scale": {}}
-    return {key: as_text(value) for key, value in flat(config).items()}
 
 
 def _measured(variant: Variant) -> dict[str, np.ndarray]:

@@ -30,7 +30,7 @@ def report(runs_dir: Path, *arguments: str) -> int:
 
 def claims_of(runs: Runs) -> str:
     """The document of the claims."""
-    return claims_report(runs, None, claims_sections(runs).values())
+    return claims_report(runs, None, claims_sections(runs, None).values())
 
 
 def verdicts_of(document: str, section: str) -> dict[str, str]:

@@ -130,21 +130,18 @@ def _draw_environment(axes: Axes, variant: Variant) -> None:
     axes.set(xlim=(x0 - margin, x1 + margin), ylim=(y0 - length / 3, y1 + length / 3))
     axes.set_title("target task", pad=4)
     axes.set_facecolor("0.88")
-    strip = {"facecolor": "white", "edgecolor": "none"}
-    axes.add_patch(Rectangle((x0, y0), length, y1 - y0, **strip))
+    axes.add_patch(Rectangle((x0, y0), length, y1 - y0, fc="white", ec="none"))
     axes.hlines([y0, y1], x0, x1, color="0.5", linewidth=0.8, linestyle=(0, (3, 2)))
     axes.vlines([x0, x1], *axes.get_ylim(), color="black", linewidth=2.2)
-    place = {"facecolor": style.colour("B"), "edgecolor": "black"}
-    axes.add_patch(Circle(goal[:2], goal[2], **place))
-    place = {"facecolor": style.colour("SC"), "edgecolor": style.colour("DQN")}
-    size = start[2:] - start[:2]
-    axes.add_patch(Rectangle(start[:2], *size, linewidth=2, zorder=3, **place))
+    axes.add_patch(Circle(goal[:2], goal[2], fc=style.colour("B"), ec="black"))
+    look = {"fc": style.colour("SC"), "ec": style.colour("DQN"), "lw": 2, "zorder": 3}
+    axes.add_patch(Rectangle(start[:2], *(start[2:] - start[:2]), **look))
     middle, speed, top = (x0 + x1) / 2, float(np.hypot(*drift)), axes.get_ylim()[1]
     names = [("goal", goal[0]), ("start", (start[0] + start[2]) / 2)]
     if speed > 0:
         axes.quiver(middle, (y0 + y1) / 2, *(drift / speed), scale=6, width=0.012)
         names.append((f"drift {speed:g}", middle))
-    small = {"fontsize": 6.5, "xycoords": "data", "textcoords": "offset points"}
+    small = {"fontsize": 6.5, "textcoords": "offset points"}
     for name, x in names:
         axes.annotate(name, (x, y1), (0, 2), ha="center", va="bottom", **small)
     for text, at, shift, side in (
