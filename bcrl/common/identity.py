@@ -1,5 +1,6 @@
 """Which part of a config decides numbers, and where two configs differ in it."""
 
+import json
 from typing import Any
 
 Plain = dict[str, Any]  # a resolved config: dicts, lists and scalars
@@ -30,3 +31,8 @@ def flat(config: Plain, prefix: str = "") -> Plain:
         inner = isinstance(value, dict)
         out |= flat(value, f"{prefix}{key}.") if inner else {f"{prefix}{key}": value}
     return out
+
+
+def as_text(value: object) -> str:
+    """A value as JSON, a string as it is."""
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

@@ -77,7 +77,8 @@ MEASURES = {
 }
 _STATISTICS = {"deviation of return": np.std}  # of others the mean over seeds
 
-_DATA = yaml.safe_load(Path(__file__).with_name("claims.yaml").read_text("utf-8"))
+_TEXT = Path(__file__).with_name("claims.yaml").read_text("utf-8")
+_DATA = yaml.safe_load(_TEXT.format(optimal=_OPTIMAL, near=_NEAR))
 _TITLES: dict[str, str] = _DATA["titles"]  # by environment
 #: Environment, family → statement → quantity, what is expected of it, and of whom.
 CLAIMS: dict[tuple[str, ...], dict[str, list[str]]] = {
@@ -85,18 +86,14 @@ CLAIMS: dict[tuple[str, ...], dict[str, list[str]]] = {
 }
 
 
-def claims_report(runs: Runs, tag: str | None = None) -> str:
-    """The Markdown document: per environment the claims and the values behind them."""
-    tagged = f", variants @{tag}" if tag else ""
-    notes = runs.notes_on(tag)
-    parts = [f"# The paper's claims, scale {runs.scale}{tagged}\n"]
+def claims_report(runs: Runs, tag: str | None, claims: Iterable[Section]) -> str:
+    """The Markdown document of the `claims_sections` and the notes on the runs."""
+    tagged, notes = f", variants @{tag}" if tag else "", runs.notes_on(tag)
+    parts: list[object] = [f"# The paper's claims, scale {runs.scale}{tagged}\n"]
     if lacking := incomplete(notes):
         parts.append(f"**{lacking}**\n")
-    sections = claims_sections(runs, tag).values()
-    parts += [PARAGRAPHS["claims"], PARAGRAPHS["glossary"], *map(str, sections)]
-    if notes:
-        parts += ["## Notes on the runs\n", *(f"- {note.text}" for note in notes), ""]
-    return "\n".join(parts)
+    parts += [PARAGRAPHS["claims"], PARAGRAPHS["glossary"], *claims]
+    return "\n".join(map(str, [*parts, *tables.notes_section(notes)]))
 
 
 def claims_sections(runs: Runs, tag: str | None) -> dict[tuple[str, str], Section]:
@@ -108,17 +105,15 @@ def claims_sections(runs: Runs, tag: str | None) -> dict[tuple[str, str], Sectio
             found[env, family] = Section(_TITLES[env], ["No runs.\n"])
             continue
         variants = methods.values()
-        parts: list[str | TextTable] = []
-        if len({variant.tag for variant in variants}) > 1:
-            parts.append(f"{tags_shown(methods)}; the others are untagged.\n")
         rows = [_judged(text, claim, methods) for text, claim in claims.items()]
         # Reasons are left aside.
         verdicts = Counter(re.split(r" \(|:", row["verdict"])[0] for row in rows)
         counted = ", ".join(f"{n} {verdict}" for verdict, n in verdicts.most_common())
-        seconds = sum(variant.cpu_seconds for variant in variants)
-        parts += [f"{len(rows)} claims: {counted}.\n", TextTable(rows)]
-        parts += _values(variants)
-        parts.append(f"CPU time of these runs: {tables.duration(seconds)}.\n")
+        parts = [f"{len(rows)} claims: {counted}.\n", TextTable(rows)]
+        if len({variant.tag for variant in variants}) > 1:
+            parts.insert(0, f"{tags_shown(methods)}; the others are untagged.\n")
+        seconds = tables.duration(sum(variant.cpu_seconds for variant in variants))
+        parts += [*_values(variants, family), f"CPU time of these runs: {seconds}.\n"]
         found[env, family] = Section(_TITLES[env], parts)
     return found
 
@@ -181,7 +176,7 @@ def verdict(value: float, interval: Interval, expect: str, seeds: int) -> str:
     return "holds" if holds else "does not hold" if fails else "undecided"
 
 
-def _values(variants: Iterable[Variant]) -> list[str | TextTable]:
+def _values(variants: Iterable[Variant], family: str) -> list[str | TextTable]:
     """What every method reaches, and metrics of FQI at every stage's end."""
     common = set.intersection(*(set(v.metrics) for v in variants))
     rows = []
@@ -199,16 +194,14 @@ def _values(variants: Iterable[Variant]) -> list[str | TextTable]:
             low, high = map(number, statistics.share_interval(hits, n))
             row["seeds solving the target"] = f"{hits}/{n} [{low}, {high}]"
         rows.append(row)
-    parts: list[str | TextTable] = [PARAGRAPHS[variant.family], TextTable(rows)]
-    columns = [f"stage {k + 1}" for k in range(max(v.stage[-1] for v in variants))]
+    parts: list[str | TextTable] = [PARAGRAPHS[family], TextTable(rows)]
+    stages = range(1, 1 + max(v.stage[-1] for v in variants))
     for metric in (name for name in _AT_ENDS if name in common):
         rows = []
-        for variant in variants:
-            row, values = {"method": variant.name}, variant.metrics[metric]
-            row |= dict.fromkeys(columns, ABSENT)
-            for at in np.flatnonzero(np.diff(variant.stage, append=0)):
-                row[f"stage {variant.stage[at]}"] = number(values[:, at].mean())
-            rows.append(row)
+        for v in variants:
+            ends = {n: number(_at(v, metric, n).mean()) for n in np.unique(v.stage)}
+            row = {f"stage {n}": ends.get(n, ABSENT) for n in stages}
+            rows.append({"method": v.name} | row)
         parts += [f"{_AT_ENDS[metric]} at every stage's end:\n", TextTable(rows)]
     return parts
 

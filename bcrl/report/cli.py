@@ -2,7 +2,8 @@
 
 import inspect
 import sys
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -11,18 +12,18 @@ from matplotlib.figure import Figure
 from bcrl.common.files import make_directory, write_text
 from bcrl.common.terminal import ready, say, show
 from bcrl.errors import BcrlError
+from bcrl.report import tables
 from bcrl.report.animation import animations, gif_of
-from bcrl.report.claims import claims_report
+from bcrl.report.claims import claims_report, claims_sections
 from bcrl.report.figures import curves, linear, maze, style
 from bcrl.report.load import load_runs
 from bcrl.report.page import page
-from bcrl.report.tables import PARAGRAPHS, aggregate, sweep_sections, sweep_table
-from bcrl.report.variants import COMPARED, LINEAR, Runs, env_title
+from bcrl.report.variants import COMPARED, LINEAR, Pair, Runs, env_title
 from bcrl.results.arguments import ResultsParser
 
 CAR, MAZE, LQ = ("car_on_hill", "FQI"), ("maze", "FQI"), (LINEAR, "DQN")
 #: figure → its runs' environment and family, experiment, method it cannot do without
-FIGURES: dict[str, tuple[tuple[str, str], str, str | None, Callable[..., Figure]]] = {
+FIGURES: dict[str, tuple[Pair, str, str | None, Callable[..., Figure]]] = {
     "1": (CAR, "fig1", None, curves.figure_1),
     "2": (MAZE, "fig2", None, curves.figure_2),
     "3": (MAZE, "fig2", None, maze.figure_3),
@@ -53,44 +54,42 @@ def _parser() -> ResultsParser:
 
 
 def report(
-    runs: Runs, out: Path, figures: Sequence[str], tag: str | None
+    runs: Runs, out: Path, figures: Collection[str], tag: str | None
 ) -> tuple[list[Path], list[str]]:
     """Write these figures and all documents: the files, what was skipped and why."""
     suffix = f"{runs.scale}@{tag}" if tag else runs.scale
     files: list[Path] = []
-    skipped, drawn = [], {}
+    skipped, drawn = [], defaultdict(list)
 
-    def save(name: str, title: str, draw: Callable[..., Figure], *of: object) -> Path:
-        """The PNG of a figure that was drawn and saved."""
-        with style.sheet():
-            saved = style.save_figure(draw(*of), out, name, title)
+    def save(figure: Figure, name: str, title: str, pair: Pair, caption: str) -> None:
+        """Save a figure, and keep its PNG and caption for the page."""
+        saved = style.save_figure(figure, out, name, title)
         files.extend(saved)
-        return saved[0]
+        drawn[pair].append((saved[0], caption))
 
-    for name in (name for name in figures if name != CURVES):
-        pair, experiment, needed, draw = FIGURES[name]
+    for name, (pair, experiment, needed, draw) in FIGURES.items():
+        if name not in figures:
+            continue
         methods = runs.compared(pair[0], tag, pair[1])
         if methods and (not needed or needed in methods):
             title = f"Klink et al. (2022), figure {name}, reproduced: {suffix}"
-            image = save(f"figure_{name}_{suffix}", title, draw, runs, tag)
             caption = f"Figure {name}. {inspect.getdoc(draw).splitlines()[0]}"
-            drawn.setdefault(pair, []).append((image, caption))
+            save(draw(runs, tag), f"figure_{name}_{suffix}", title, pair, caption)
             continue
         lacking = f"{pair[0]}/{needed or '*'}{f'@{tag}' if tag else ''}"
         which = {None: "", "released": "_released"}.get(tag, f" tag={tag}")
         command = f"`bcrl experiment={experiment}{which} scale={runs.scale}`"
         skipped.append(f"figure {name}: no runs of {lacking}: {command} makes them")
     others = [p for p in runs.pairs if p not in COMPARED] if CURVES in figures else []
-    for env, family in others:
+    for pair in others:
         # Where there are tagged variants only, one figure per tag.
-        tags = dict.fromkeys(variant.tag for variant in runs.of(env, family))
-        for each in [tag] if tag in tags else tags if tag is None else ():
+        tags = dict.fromkeys(variant.tag for variant in runs.of(*pair))
+        for each in tags if tag is None and None not in tags else tags.keys() & {tag}:
             place = f"{runs.scale}@{each}" if each else runs.scale
-            title = f"{env}, {family}: learning curves, {place}"
-            of = (curves.figure_curves, runs, env, family, each)
-            image = save(f"curves_{env}_{family}_{place}", title, *of)
-            picture = image, "Mean over seeds with 95 % intervals."
-            drawn.setdefault((env, family), []).append(picture)
+            title = f"{', '.join(pair)}: learning curves, {place}"
+            caption = "Mean over seeds with 95 % intervals."
+            figure = curves.figure_curves(runs, *pair, each)
+            save(figure, "_".join(["curves", *pair, place]), title, pair, caption)
 
     def write(name: str, text: str | pd.DataFrame) -> None:
         if isinstance(text, pd.DataFrame):
@@ -98,21 +97,24 @@ def report(
         files.append(write_text(out / name, text))
 
     for family, stem in (("FQI", "aggregate"), ("DQN", "aggregate_dqn")):
-        if family in {family for _, family in runs.pairs}:
-            write(f"{stem}_{runs.scale}.csv", aggregate(runs, family))
-    write(f"claims_{suffix}.md", claims_report(runs, tag))
-    compared = sweep_table(runs)
-    if sweeps := sweep_sections(compared):
+        if any(variant.family == family for variant in runs.variants):
+            write(f"{stem}_{runs.scale}.csv", tables.aggregate(runs, family))
+    claims, compared = claims_sections(runs, tag), tables.sweep_table(runs)
+    write(f"claims_{suffix}.md", claims_report(runs, tag, claims.values()))
+    if sweeps := tables.sweep_sections(compared):
+        ours = compared.groupby(["env", "method"]).groups
+        notes = [note for note in runs.notes if (note.env, note.method) in ours]
         title = f"# Variants compared, scale {runs.scale}\n"
-        parts = [title, PARAGRAPHS["sweeps"], *map(str, sweeps)]
-        write(f"sweep_{runs.scale}.md", "\n".join(parts))
+        head = [title, tables.PARAGRAPHS["sweeps"]]
+        text = "\n".join(map(str, [*head, *sweeps, *tables.notes_section(notes)]))
+        write(f"sweep_{runs.scale}.md", text)
         write(f"sweep_{runs.scale}.csv", compared)
     agents = [
         (path, f"{env_title(variant.env)}: {variant.name}")
         for variant in runs.variants
         if tag in (None, variant.tag) and (path := gif_of(runs, variant, out)).exists()
     ]
-    write(f"report_{suffix}.html", page(runs, tag, drawn, agents, sweeps))
+    write(f"report_{suffix}.html", page(runs, tag, drawn, agents, claims, sweeps))
     return files, skipped
 
 
@@ -121,8 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ready()
     try:
         options = _parser().parsed(arguments)
-        chosen = dict.fromkeys(options.figures)
-        chosen = [*FIGURES, CURVES] if "all" in chosen else [*chosen]
+        chosen = [*FIGURES, CURVES] if "all" in options.figures else options.figures
         runs = load_runs(options.runs_dir, options.scale, options.allow_incomplete)
         for note in runs.notes:
             say(f"note: {note.text}")
@@ -131,12 +132,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         shown, not_shown = [], []
         if options.gif is not None:  # first: the page shows them
             shown, not_shown = animations(runs, out, options.tag, options.gif)
-        files, skipped = report(runs, out, chosen, options.tag)
+        with style.sheet():
+            files, skipped = report(runs, out, chosen, options.tag)
     except BcrlError as error:
         say(f"bcrl-report: {error}")
         return 2
-    for line in skipped + not_shown if options.scale != "search" else ():
-        say(f"skipped {line}")
+    if options.scale != "search":
+        for line in skipped + not_shown:
+            say(f"skipped {line}")
     show("\n".join(map(str, files + shown)))
     return 0
 

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import to_hex, to_rgb
 
-from bcrl.common.divergence import diverging
 from bcrl.report.figures import curves, style
 from bcrl.report.statistics import bootstrap_curves
 from bcrl.report.variants import Runs, Variant
@@ -16,7 +15,7 @@ _SEEDS = 20  # whose own lines can be shown, the first of a variant's
 _FIRST_SHOWN = 8  # variants that are shown at first if none has the tag
 #: Metrics that are shown at first, if the family has many.
 _SHOWN = {"DQN": ("return", "success_rate", "greedy_return")}
-_DASHES = ("7 3", "2 3", "9 3 2 3", "5 2")  # one's own algorithms, then other tags
+_DASHES = ("7 3", "2 3", "9 3 2 3", "5 2")  # own algorithms first
 
 
 def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, Any]:
@@ -27,7 +26,7 @@ def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, 
     tags = list(dict.fromkeys(v.tag for v in (ours | found).values()))
 
     def dash(variant: Variant) -> str:
-        if place := tags.index(variant.tag):  # another look than the first tag's
+        if place := tags.index(variant.tag) + (variant.name not in ours):
             return _DASHES[place % len(_DASHES)]
         return _DASHES[0] if style.dashed(variant.method) else ""
 
@@ -52,18 +51,17 @@ def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, 
 
 
 def _series(variant: Variant, metrics: list[str]) -> dict[str, Any]:
-    """A variant's curves, which all have the same points; those `far` off are cut."""
+    """A variant's colours and curves, which all have the same points."""
     rows, light = curves.spread_rows(variant), style.colour(variant.method)
-    far, drawn = diverging(variant.metrics), {}
+    drawn = {}
     for metric in (name for name in metrics if name in variant.metrics):
         values = variant.metrics[metric][:, rows]
-        low, high = bootstrap_curves(values)
-        q1, median, q3 = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
-        lines = {"low": low, "high": high, "median": median, "q1": q1, "q3": q3}
-        drawn[metric] = {name: _numbers(line) for name, line in lines.items()} | {
+        lines = *bootstrap_curves(values), *np.quantile(values, [0.25, 0.5, 0.75], 0)
+        named = zip(("low", "high", "q1", "median", "q3"), lines, strict=True)
+        drawn[metric] = {name: _numbers(line) for name, line in named} | {
             "mean": _numbers(values.mean(axis=0), 7),
             "seeds": [_numbers(seed) for seed in values[:_SEEDS]],
-            "far": metric in far,
+            "far": metric in variant.far,
         }
     # The same hue, light enough for a dark page; black turns nearly white.
     hue, lightness, saturation = colorsys.rgb_to_hls(*to_rgb(light))

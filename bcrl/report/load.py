@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from bcrl.common.divergence import diverging
 from bcrl.errors import BcrlError
 from bcrl.report.variants import COMPARED, Note, Runs, Variant, across_methods, listed
 from bcrl.results.integrity import Checked, check_tree
@@ -25,8 +24,8 @@ def load_runs(runs_dir: Path, scale: str, allow_incomplete: bool = False) -> Run
         lines = [f"nothing is drawn, because in {runs_dir / scale}:"]
         lines += [f"  {finding}" for finding in rejected[:LISTED]]
         if (more := len(rejected) - LISTED) > 0:
-            shown = shlex.join(["bcrl-verify", str(runs_dir)])
-            lines.append(f"  and {more} more; `{shown}` lists all")
+            command = shlex.join(["bcrl-verify", str(runs_dir)])
+            lines.append(f"  and {more} more; `{command}` lists all")
         if any(finding.kind == INCOMPLETE for finding in rejected):
             lines.append("--allow-incomplete draws what is complete, and says so")
         raise BcrlError("\n".join(lines))
@@ -34,19 +33,21 @@ def load_runs(runs_dir: Path, scale: str, allow_incomplete: bool = False) -> Run
     loaded = [_variant(each, notes) for each in checked]
     runs = Runs(scale, tuple(filter(None, loaded)), notes)
     if not runs.variants:
-        others = {p.parts[-4] for p in runs_dir.glob("*/*/*/seed_*.json")} - {scale}
-        there = f"; there are runs at scale {listed(sorted(others))}" if others else ""
-        shown = f"`{shlex.join(['bcrl', 'experiment=fig1', f'scale={scale}'])}`"
-        what = f"no complete runs under {runs_dir / scale}{there}"
-        raise BcrlError(f"{what}; {shown} makes those of figure 1")
+        parts = [f"no complete runs under {runs_dir / scale}"]
+        parts += [note.text for note in notes[:1]]
+        scales = {path.parts[-4] for path in runs_dir.glob("*/*/*/seed_*.json")}
+        if others := sorted(scales - {scale}):
+            parts.append(f"there are runs at scale {listed(others)}")
+        command = shlex.join(["bcrl", "experiment=fig1", f"scale={scale}"])
+        raise BcrlError("; ".join([*parts, f"`{command}` makes those of figure 1"]))
     for env, family in runs.pairs:
         expected = COMPARED.get((env, family))
-        for tag in sorted({v.tag or "" for v in runs.of(env, family)}):
-            found = runs.tagged(env, family, tag or None)
+        for tag in dict.fromkeys(v.tag for v in runs.of(env, family)):
+            found = runs.tagged(env, family, tag)
             methods = {n: v for n, v in found.items() if n in (expected or found)}
             # A tag may be meant for one method only, so absent ones go unmentioned.
             awaited = methods if tag else expected or methods
-            notes.extend(across_methods(methods, awaited, env, tag or None, family))
+            notes.extend(across_methods(methods, awaited, env, tag, family))
     return runs
 
 
@@ -56,17 +57,16 @@ def _variant(checked: Checked, notes: list[Note]) -> Variant | None:
     method, _, tag = folder.name.partition("@")
 
     def note(text: str, footer: str = "", incomplete: bool = False) -> None:
-        about = {"footer": footer, "method": method, "incomplete": incomplete}
-        text, env = f"{folder}: {text}", folder.parent.name
-        notes.append(Note(text, env, tag or None, **about))
+        about = folder.parent.name, tag or None, footer, method
+        notes.append(Note(f"{folder}: {text}", *about, incomplete=incomplete))
 
     failed = tuple(seed for seed, d in documents.items() if state_of(d) == FAILED)
     if checked.findings:
         count = f"{len(tables)} of {len(checked.requested)} seeds"
         why = "; ".join(f"{f.path.name} {f.what}" for f in checked.findings)
         also = f" ({len(failed)} failed)" if failed else ""
-        text = f"INCOMPLETE, {count} drawn: {why}"
-        note(text, f"{folder.name} {count}{also}", incomplete=True)
+        footer = f"{folder.name} {count}{also}"
+        note(f"INCOMPLETE, {count} drawn: {why}", footer, incomplete=True)
     if not tables:
         return None
     first, *_ = tables.values()
@@ -75,18 +75,15 @@ def _variant(checked: Checked, notes: list[Note]) -> Variant | None:
     if lacking := [name for name in needed if name not in first]:
         note(f"does not record {listed(lacking)}: left out")
         return None
-    metrics = {
-        str(name): np.stack([table[name].to_numpy() for table in tables.values()])
-        for name in first
-    }
+    values = np.stack([table.to_numpy().T for table in tables.values()], axis=1)
+    values[~np.isfinite(values)] = np.nan  # a gap, not a line to infinity
+    metrics = dict(zip(map(str, first), values, strict=True))
     rows = [metrics.pop(name)[0].astype(np.int64) for name in INDEX[family]]
-    for values in metrics.values():
-        values[~np.isfinite(values)] = np.nan  # a gap, not a line to infinity
     sidecars = tuple(documents[seed] for seed in tables)
-    made = {json.dumps([s.get("git"), s.get("versions")]) for s in sidecars}
-    if len(made) > 1:
+    if len({json.dumps([s.get("git"), s.get("versions")]) for s in sidecars}) > 1:
         note("seeds of different revisions or versions (see the page's provenance)")
-    if far := diverging(metrics):
-        which = ", ".join(f"{name} up to {value:.3g}" for name, value in far.items())
+    made = Variant(folder, family, tuple(tables), *rows, metrics, sidecars, failed)
+    if made.far:
+        which = ", ".join(f"{name} up to {most:.3g}" for name, most in made.far.items())
         note(f"diverges, {which}", f"{folder.name} diverges ({which})")
-    return Variant(folder, family, tuple(tables), *rows, metrics, sidecars, failed)
+    return made

@@ -2,7 +2,6 @@
 
 import base64
 import hashlib
-import json
 import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -13,14 +12,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from bcrl import __version__
-from bcrl.common.identity import differences, flat, identity
-from bcrl.report.claims import claims_sections
+from bcrl.common.identity import as_text, differences, flat, identity
 from bcrl.report.curve_data import curve_data
 from bcrl.report.tables import ABSENT, PARAGRAPHS, Section, TextTable, duration, number
-from bcrl.report.variants import Runs, env_title, incomplete
+from bcrl.report.variants import Pair, Runs, env_title, incomplete
 from bcrl.results.layout import seed_path, spelled
 
-Pair = tuple[str, str]  # environment and family
 Picture = tuple[Path, str]  # an image file and what it shows
 
 
@@ -29,20 +26,18 @@ def page(
     tag: str | None,
     figures: Mapping[Pair, Sequence[Picture]],
     agents: Sequence[Picture],
+    claims: Mapping[Pair, Section],
     sweeps: Sequence[Section],
 ) -> str:
     """The page of one scale's runs. `figures` that the paper doesn't have are for
     browsers that run no scripts; `agents` move."""
-    notes, claims = runs.notes_on(tag), claims_sections(runs, tag)
+    notes = runs.notes_on(tag)
+    given = {"version": __version__, "texts": PARAGRAPHS, "runs": runs, "tag": tag}
+    given |= {"figures": figures, "claims": claims, "agents": agents, "sweeps": sweeps}
+    given |= {"notes": notes, "incomplete": incomplete(notes)}
     return _JINJA.get_template("page.html").render(
-        {"version": __version__, "texts": PARAGRAPHS, "runs": runs, "tag": tag},
-        notes=notes,
-        incomplete=incomplete(notes),
+        given,
         facts=_facts(runs, claims),
-        figures=figures,
-        claims=claims,
-        agents=agents,
-        sweeps=sweeps,
         costs=costs(runs),
         configs=configurations(runs),
         provenance=seed_origins(runs),
@@ -91,25 +86,20 @@ def configurations(runs: Runs) -> list[dict[str, Any]]:
     groups = []
     for env, family in runs.pairs:
         reference, *_ = ours = runs.of(env, family)
-        other, found = reference.sidecars[0]["config"], []
+        title, found = f"{env_title(env)}, {family}", []
         for variant in ours:
-            config = variant.sidecars[0]["config"]
-            settings, differing = flat(identity(config)), differences(config, other)
+            differing = differences(variant.config, reference.config)
+            settings = flat(identity(variant.config))
             settings |= {key: mine for key, (mine, _) in differing.items()}
-            theirs = {key: _text(value) for key, (_, value) in differing.items()}
-            lines = [(k, _text(v), theirs.get(k)) for k, v in settings.items()]
+            theirs = {key: as_text(value) for key, (_, value) in differing.items()}
+            lines = [(k, as_text(v), theirs.get(k)) for k, v in settings.items()]
             commands = dict.fromkeys(s.get("command") for s in variant.sidecars)
             differ = f", {len(differing)} differ" if differing else ""
             about = {"name": variant.name, "summary": f"{len(lines)} settings{differ}"}
             about |= {"command": "\n".join(filter(None, commands)), "lines": lines}
             found.append(about)
-        title = f"{env_title(env)}, {family}"
         groups.append({"title": title, "reference": reference.name, "variants": found})
     return groups
-
-
-def _text(value: object) -> str:
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
 def seed_origins(runs: Runs) -> list[str | TextTable]:

@@ -1,7 +1,7 @@
 """Tables of text, the aggregate over seeds, and variants of a method compared."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,16 +9,15 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from bcrl.common.identity import flat, identity
+from bcrl.common.identity import as_text, flat, identity
 from bcrl.report.statistics import FEWEST_SEEDS, Interval, bootstrap, standard_error
-from bcrl.report.variants import WINDOW, Runs, Variant
+from bcrl.report.variants import WINDOW, Note, Runs, Variant
 from bcrl.results.layout import INDEX, spelled
 
 ABSENT = "–"  # a cell without a value
 _PATH = Path(__file__).with_name("templates") / "texts.yaml"
 _TEXT = _PATH.read_text("utf-8").format(fewest=FEWEST_SEEDS, window=WINDOW)
 PARAGRAPHS = yaml.safe_load(_TEXT)  # paragraphs of the documents and the page, by name
-_DECISIVE = {"FQI": "last_return", "DQN": "late_return"}  # means that rank variants
 
 
 class TextTable(NamedTuple):
@@ -41,6 +40,12 @@ class Section(NamedTuple):
 
     def __str__(self) -> str:
         return "\n".join([f"## {self.title}\n", *map(str, self.parts)])
+
+
+def notes_section(notes: Iterable[Note]) -> list[Section]:
+    """A section that lists the notes; none if there are none."""
+    listed = "".join(f"- {note.text}\n" for note in notes)
+    return [Section("Notes on the runs", [listed])] if listed else []
 
 
 def number(value: float) -> str:
@@ -89,41 +94,34 @@ def sweep_table(runs: Runs) -> pd.DataFrame:
     together: dict[tuple[str, str], list[Variant]] = {}
     for variant in runs.variants:
         together.setdefault((variant.env, variant.method), []).append(variant)
-    rows, decisive = [], []
+    rows = []
     for variants in (group for group in together.values() if len(group) > 1):
-        texts = pd.DataFrame([_texts(variant) for variant in variants])
+        configs = [flat(identity(v.config) | {"scale": {}}) for v in variants]
+        texts = pd.DataFrame([{k: as_text(v) for k, v in c.items()} for c in configs])
         differing = texts.loc[:, texts.nunique(dropna=False) > 1].fillna(ABSENT)
         chosen = differing.T.to_dict().values()
         for variant, settings in zip(variants, chosen, strict=True):
             row: dict[str, object] = {"env": variant.env, "method": variant.method}
-            text = json.dumps(settings, ensure_ascii=False)
-            row |= {"variant": variant.name, "settings": text}
+            row |= {"variant": variant.name, "settings": as_text(settings)}
             n, failed = len(variant.seeds), len(variant.failed)
             row |= {"seeds": spelled(variant.seeds), "complete": n, "failed": failed}
             for name, values in _measured(variant).items():
                 low, high = bootstrap(values)
                 row |= {name: values.mean(), f"{name}_low": low, f"{name}_high": high}
             rows.append(row)
-            decisive.append(row[_DECISIVE[variant.family]])
     table = pd.DataFrame(rows)
     if rows:
-        groups = pd.Series(decisive).groupby([table["env"], table["method"]])
+        decisive = table["late_return"].fillna(table["last_return"])
+        groups = decisive.groupby([table["env"], table["method"]])
         table["best"] = groups.rank(ascending=False, method="first") == 1
     return table
-
-
-def _texts(variant: Variant) -> dict[str, str]:
-    """Dotted keys of a variant's config → values as JSON, strings without quotes."""
-    config = identity(variant.sidecars[0]["config"])
-    kept = flat({k: v for k, v in config.items() if k != "scale"})
-    return {k: json.dumps(v, ensure_ascii=False).strip('"') for k, v in kept.items()}
 
 
 def _measured(variant: Variant) -> dict[str, np.ndarray]:
     """Late and last return and success rate, (S,) each; nan for what FQI lacks."""
     names, nothing = ("return", "solved"), np.array([[np.nan]])
     last, success = (variant.metrics.get(name, nothing)[:, -1] for name in names)
-    late = nothing
+    late = nothing[:, -1]
     if variant.family == "DQN":
         late, success = variant.late("return"), variant.late("success_rate")
     return {"late_return": late, "last_return": last, "success_rate": success}

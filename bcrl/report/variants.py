@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from bcrl.common.divergence import diverging
 from bcrl.results.layout import seed_path, spelled
 from bcrl.results.read import read_arrays
 
@@ -25,6 +26,7 @@ COMPARED = {
 _TITLES = {"car_on_hill": "Car on the hill"}
 
 Methods = Mapping[str, "Variant"]  # by the name of the method
+Pair = tuple[str, str]  # environment and family
 
 
 @dataclass(frozen=True)
@@ -46,9 +48,10 @@ class Note:
 class Variant:
     """All complete seeds of one variant: S seeds, I rows (evaluations) common to them.
     `stage` and `task` (I,) are 1-based; `index` (I,) counts the iterations or, in the
-    DQN family, the environment steps of all stages so far; `metrics` are (S, I);
-    `sidecars` are the seeds' JSONs; `failed` are seeds that diverged and are left out.
-    The folder's `name` is the `method` and perhaps its `tag`: `BC-FQI@released`."""
+    DQN family, the environment steps of all stages so far; `metrics` are (S, I), those
+    that diverge are `far`; `sidecars` are the seeds' JSONs, of which the first has the
+    `config`; `failed` are seeds that diverged and are left out. The folder's `name` is
+    the `method` and perhaps its `tag`: `BC-FQI@released`."""
 
     folder: Path
     family: str
@@ -64,6 +67,7 @@ class Variant:
         self.env, self.name = self.folder.parts[-2:]
         self.method, _, tag = self.name.partition("@")
         self.tag = tag or None
+        self.far, self.config = diverging(self.metrics), self.sidecars[0]["config"]
 
     @property
     def optimum(self) -> float | None:
@@ -109,7 +113,7 @@ class Runs:
     notes: list[Note] = field(default_factory=list)
 
     @property
-    def pairs(self) -> list[tuple[str, str]]:
+    def pairs(self) -> list[Pair]:
         """The environments and families that there are runs of."""
         return list(dict.fromkeys((v.env, v.family) for v in self.variants))
 
@@ -184,9 +188,8 @@ def remarks(runs: Runs, methods: Methods, compares: bool = True) -> list[str]:
     shown = [note for note in runs.notes if note.env == env and belongs(note)]
     if compares and len(tags) > 1:  # no notes were made for such a mixture yet
         shown += across_methods(methods, methods, env, None, family)
-    odd = [note.footer for note in shown if note.footer and not note.incomplete]
-    lines = [incomplete(shown), f"Note: {'; '.join(odd)}" if odd else ""]
-    return list(filter(None, lines))
+    odd = "; ".join(n.footer for n in shown if n.footer and not n.incomplete)
+    return list(filter(None, [incomplete(shown), odd and f"Note: {odd}"]))
 
 
 def incomplete(notes: Iterable[Note]) -> str:

@@ -73,30 +73,34 @@ def check_folder(folder: Path) -> Checked:
         csv, npz = (seed_path(folder, seed, suffix) for suffix in ("csv", "npz"))
         try:
             documents[seed] = document = read.read_document(folder, seed)
-            state = state_of(document)
-            if state != layout.RUNNING and "sha256" in document:
+            complete = (state := state_of(document)) == layout.COMPLETE
+            if complete or (state != layout.RUNNING and "sha256" in document):
                 read.read_recorded(npz, document)
-                read.read_recorded(csv, document)
-            if state == layout.COMPLETE:
-                tables[seed] = read.read_csv(csv, document)
+                data = read.read_recorded(csv, document)
+                if complete:
+                    tables[seed] = read.parsed(csv, data, document)
         except Finding as finding:
             findings.append(finding)
     findings += [*_config_findings(folder, documents), *_index_findings(folder, tables)]
     for seed, document in documents.items():
-        if state_of(document) != layout.COMPLETE:
+        if (state := state_of(document)) != layout.COMPLETE:
             path, what = seed_path(folder, seed, "json"), f'says "{document["status"]}"'
-            remedy = f"wait if it is being computed, else {AGAIN}"
-            findings.append(Finding(path, what, remedy, INCOMPLETE))
+            wait = "wait if it is being computed, else " * (state == layout.RUNNING)
+            findings.append(Finding(path, what, wait + _again([document]), INCOMPLETE))
     asked = set().union(*map(requested, documents.values()))
     if missing := sorted(asked - numbers):
-        made = (d for d in documents.values() if missing[0] in requested(d))
-        typed = next(filter(None, (d.get("command") for d in made)), "")
+        made = [d for d in documents.values() if missing[0] in requested(d)]
         what = f"lacks seeds {layout.spelled(missing)}, which a command was to make"
-        remedy = f"{AGAIN}{f' (`{typed}`)' if typed else ''}"
-        findings.append(Finding(folder, what, remedy, INCOMPLETE))
+        findings.append(Finding(folder, what, _again(made), INCOMPLETE))
     if not numbers:
         findings.append(Finding(folder, "has no seeds", AGAIN, INCOMPLETE))
     return Checked(folder, findings, documents, tables, asked)
+
+
+def _again(documents: list[Document]) -> str:
+    """The advice to run the command again, with the first command that is recorded."""
+    typed = next(filter(None, (d.get("command") for d in documents)), "")
+    return f"{AGAIN} (`{typed}`)" if typed else AGAIN
 
 
 def _config_findings(folder: Path, documents: dict[int, Document]) -> Iterator[Finding]:

@@ -48,6 +48,8 @@ def read_document(folder: Path, seed: int) -> Document:
         raise Finding(path, f"has schema {schema!r}, not {layout.SCHEMA}")
     if not intact:
         raise Finding(path, "was changed after it was written (see its digest)")
+    if not {"status", "asked", "config"} <= document.keys():
+        raise Finding(path, f"lacks entries of schema {layout.SCHEMA}")
     for key, value in layout.belongs_to(folder, seed).items():
         if document.get(key) != value:
             what = f"belongs to {key} {document.get(key)!r}, not {value!r}"
@@ -69,14 +71,13 @@ def _bytes(path: Path) -> bytes:
 def read_recorded(path: Path, document: Document) -> bytes:
     """A CSV's or NPZ's bytes; Finding unless the seed's JSON has their hash."""
     data = _bytes(path)
-    if sha256(data) != document["sha256"][path.suffix[1:]]:
+    if sha256(data) != document.get("sha256", {}).get(path.suffix[1:]):
         raise Finding(path, f"is not what {path.stem}.json has the SHA-256 of")
     return data
 
 
-def read_csv(path: Path, document: Document) -> pd.DataFrame:
-    """A complete seed's table, all columns numbers; Finding if it isn't one."""
-    data = read_recorded(path, document)
+def parsed(path: Path, data: bytes, document: Document) -> pd.DataFrame:
+    """The table of a complete seed's CSV; Finding unless all its columns are sound."""
     try:
         table = pd.read_csv(io.BytesIO(data), dtype=float)
     except ValueError as error:
@@ -92,10 +93,9 @@ def read_csv(path: Path, document: Document) -> pd.DataFrame:
         raise Finding(path, f"has the header {found}, expected {','.join(expected)}")
     if what := _disorder(table):
         raise Finding(path, what)
-    for name in expected:
-        bad = np.flatnonzero(~np.isfinite(table[name]))
-        if name in finite and len(bad):
-            raise Finding(path, f"has a non-finite {name} in row {bad[0] + 1}")
+    checked = [name for name in expected if name in finite]
+    for column, row in np.argwhere(~np.isfinite(table[checked].to_numpy(float).T)):
+        raise Finding(path, f"has a non-finite {checked[column]} in row {row + 1}")
     return table
 
 

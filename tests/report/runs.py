@@ -7,7 +7,8 @@ import numpy as np
 import pandas as pd
 
 from bcrl.report import cli
-from bcrl.report.variants import COMPARED, METHODS
+from bcrl.report.claims import claims_report, claims_sections
+from bcrl.report.variants import COMPARED, METHODS, Runs
 from bcrl.results.layout import DQN_METRICS, seed_path
 from tests.results.made_up import made_up_plan, write_seeds
 
@@ -25,6 +26,11 @@ PLANE = np.array([(x, 0, y, 0) for x in range(-20, 21) for y in range(-20, 21)])
 def report(runs_dir: Path, *arguments: str) -> int:
     """`bcrl-report` of the smoke runs in a folder: its exit code."""
     return cli.main(["--runs-dir", str(runs_dir), "--scale", "smoke", *arguments])
+
+
+def claims_of(runs: Runs) -> str:
+    """The document of the claims."""
+    return claims_report(runs, None, claims_sections(runs, None).values())
 
 
 def verdicts_of(document: str, section: str) -> dict[str, str]:

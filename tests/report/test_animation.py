@@ -11,12 +11,10 @@ from bcrl.report.animation import frames, typical_seed
 from bcrl.report.load import load_runs
 from bcrl.results.layout import seed_path
 from bcrl.results.read import read_arrays
-from bcrl.run import runner
-from tests.conftest import plan
 from tests.report.runs import report
 from tests.results.made_up import made_up_plan, write_seeds
+from tests.run.runs import FQI, run
 
-SMALL = ("scale=smoke", "seeds.count=2", "progress=none")
 CAR = CarOnHill(mass=1.2)
 SECTION = {"name": "car_on_hill", "tasks": {"mass": [0.8, 1.2]}, "gamma": 0.95}
 SECTION |= {"horizon": 100, "metrics": ["q_error", "return"]}
@@ -47,8 +45,7 @@ def gifs(runs_dir, *options: str) -> list[str]:
 
 def recorded(runs_dir, *choice: str):
     """Run a plan; the plan, states and actions of each seed's episode."""
-    p = plan(*choice, *SMALL, f"runs_dir={runs_dir}")
-    runner.run(p)
+    p = run(runs_dir, *choice, *FQI)
     for seed in p.seeds:
         path = seed_path(p.directory, seed, "npz")
         yield p, *read_arrays(path, "trajectory", "trajectory_actions")
@@ -137,9 +134,8 @@ def test_a_run_that_cannot_be_shown_is_named(changed, message, tmp_path, capsys)
 @pytest.mark.slow
 def test_a_simulators_episode_is_played_once_more(tmp_path):
     pytest.importorskip("pygame")
-    options = (f"runs_dir={tmp_path}", "env.horizon=12", "env.starts=2", *SMALL)
-    made = plan("env=cart_pole", "variant=BC", "tag=x", *options)
-    runner.run(made)
+    options = ("tag=x", "env.horizon=12", "env.starts=2", *FQI)
+    made = run(tmp_path, "env=cart_pole", "variant=BC", *options)
     assert len(gifs(tmp_path, "--gif")) == 1
     (variant,) = load_runs(tmp_path, "smoke").variants
     shown, _ = frames(variant, 0)

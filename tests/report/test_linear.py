@@ -5,12 +5,11 @@ import pandas as pd
 import pytest
 
 from bcrl.errors import BcrlError
-from bcrl.report.claims import claims_report
 from bcrl.report.figures import style
 from bcrl.report.figures.linear import figure_4a, figure_4b, pretraining, prior
 from bcrl.report.load import load_runs
 from bcrl.report.tables import number, sweep_sections, sweep_table
-from tests.report.runs import SEVEN, csv_of, report, verdicts_of, write_dqn
+from tests.report.runs import SEVEN, claims_of, csv_of, report, verdicts_of, write_dqn
 from tests.results.made_up import edit_csv, made_up_plan, reseal, write_seeds
 
 
@@ -35,7 +34,7 @@ def test_failed_seeds_are_left_out_by_name(tmp_path):
     runs = load_runs(tmp_path, "smoke", allow_incomplete=True)
     variant = runs.methods("linear_system", None, "DQN")["DQN"]
     assert (variant.seeds, variant.failed) == ((0, 1, 3, 4, 5), (2,))
-    document = claims_report(runs)
+    document = claims_of(runs)
     assert "| DQN | 5 (1 failed) |" in document
     assert "S-DQN 5 of 6 seeds" in document
     footer = figure_4a(runs).get_supxlabel()
@@ -129,12 +128,12 @@ def test_untagged_runs_stand_in(tmp_path, capsys):
 
 def test_claims(tmp_path):
     write_dqn(tmp_path, scatter=0.5)
-    found = verdicts_of(claims_report(load_runs(tmp_path, "smoke")), "Linear")
+    found = verdicts_of(claims_of(load_runs(tmp_path, "smoke")), "Linear")
     assert len(found) == 8
     assert set(found.values()) == {"holds"}
     write_dqn(tmp_path, ("BC-DQN",), scatter=0.5, shift=-60.0)
     write_dqn(tmp_path, ("RPL",), scatter=0.5, shift=60.0)
-    found = verdicts_of(claims_report(load_runs(tmp_path, "smoke")), "Linear")
+    found = verdicts_of(claims_of(load_runs(tmp_path, "smoke")), "Linear")
     assert found["BC-DQN ends better than C-DQN"] == "does not hold"
     assert found["RPL does not improve on DQN"] == "does not hold"
     assert found["PPR does not improve on DQN"] == "holds"
@@ -188,5 +187,6 @@ def test_variants_of_fqi_and_failed_seeds(tmp_path):
     table = pd.read_csv(tmp_path / "figures/sweep_smoke.csv").set_index("variant")
     assert table["last_return"].to_dict() == {"FQI": -5.0, "FQI@trees100": -3.0}
     assert table["late_return"].isna().all() and table["best"].tolist() == [False, True]
+    assert f"- {path.parent}: INCOMPLETE, 2 of 3 seeds drawn: seed_0002.json" in text
     returns = "– | **−3.000 [−3.000, −3.000]** | – |"
     assert f"| FQI@trees100 | 100 | 0–1 · 2 (1 failed) | {returns}" in text

@@ -16,7 +16,7 @@ from bcrl.report.curve_data import curve_data
 from bcrl.report.figures.curves import POINTS, figure_curves, shared_spans, spread_rows
 from bcrl.report.load import load_runs
 from bcrl.results.layout import DQN_METRICS
-from tests.report.runs import report, write_fqi
+from tests.report.runs import report, write_dqn, write_fqi
 from tests.results.made_up import made_up_plan, write_seeds
 
 OWN = "my_<i>env"  # folders can be called so
@@ -130,6 +130,17 @@ def test_tags_are_there_to_be_chosen(tmp_path):
         assert len({(s["light"], s["dash"]) for s in series}) == 5
     assert report(tmp_path, "--tag", "mine", "--figures", "2") == 0
     assert "scale smoke @mine</h1>" in page_of(tmp_path, "smoke@mine")
+
+
+def test_what_the_paper_does_not_compare_differs_in_more_than_its_colour(tmp_path):
+    write_dqn(tmp_path, ("DQN", "PPR", "S-DQN"), range(2))
+    runs = load_runs(tmp_path, "smoke")
+    series = curve_data(runs, "linear_system", "DQN", None)["series"]
+    assert {s["name"]: bool(s["dash"]) for s in series} == {
+        "DQN": False,
+        "PPR": False,
+        "S-DQN": True,
+    }
 
 
 def test_it_is_whole_and_names_no_other_place(reported):

@@ -9,8 +9,9 @@ import pandas as pd
 import pytest
 from scipy import stats
 
+from bcrl.errors import BcrlError
 from bcrl.report import statistics as st
-from bcrl.report.claims import claims_report, verdict
+from bcrl.report.claims import verdict
 from bcrl.report.figures import curves, style
 from bcrl.report.figures.maze import figure_3, seed_mean_value
 from bcrl.report.load import load_runs
@@ -19,6 +20,7 @@ from bcrl.report.variants import METHODS, remarks
 from bcrl.results.layout import FQI_METRICS, seed_path
 from tests.report.runs import (
     as_claimed,
+    claims_of,
     maze_arrays,
     report,
     the_opposite,
@@ -178,7 +180,7 @@ def test_tagged_variants_are_drawn_on_request(tmp_path, capsys):
 def test_true_claims_hold_and_false_ones_do_not(tmp_path, curves):
     for env in FQI_METRICS:
         write_fqi(tmp_path, env, curves=curves)
-    document = claims_report(load_runs(tmp_path, "smoke"))
+    document = claims_of(load_runs(tmp_path, "smoke"))
     car, maze = (verdicts_of(document, section) for section in ("Car", "Maze"))
     assert (len(car), len(maze)) == (12, 17)
     if curves is as_claimed:
@@ -255,7 +257,7 @@ def test_a_method_without_a_complete_seed_is_named(runs_dir):
     for path in runs_dir.glob("smoke/car_on_hill/C-FQI/seed_*.json"):
         reseal(path, status="running")
     runs = load_runs(runs_dir, "smoke", allow_incomplete=True)
-    for text in (curves.figure_1(runs).get_supxlabel(), claims_report(runs)):
+    for text in (curves.figure_1(runs).get_supxlabel(), claims_of(runs)):
         assert "INCOMPLETE: C-FQI 0 of 6 seeds" in text and "no runs of C-FQI" in text
 
 
@@ -307,6 +309,10 @@ def test_without_runs_or_a_place_to_write_the_remedy_is_named(tmp_path, capsys):
     (tmp_path / "smoke").rename(tmp_path / "quick")
     assert report(tmp_path) == 2
     assert "there are runs at scale quick" in capsys.readouterr().err
+    for path in (tmp_path / "quick").rglob("seed_*.json"):
+        reseal(path, scale="quick", status="running")
+    with pytest.raises(BcrlError, match=r"FQI: INCOMPLETE.*; `bcrl experiment=fig1"):
+        load_runs(tmp_path, "quick", allow_incomplete=True)
     # Runs of another scale do not matter, even broken ones.
     write_fqi(tmp_path, "car_on_hill", seeds=1)
     assert report(tmp_path, "--figures", "2") == 0

@@ -1,5 +1,6 @@
 """The checks of result files: each thing that may be wrong, by name and remedy."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pandas as pd
 import pytest
 import yaml
 
+from bcrl.common import files
 from bcrl.errors import BcrlError
 from bcrl.report.load import load_runs
 from bcrl.results import verify
@@ -92,6 +94,17 @@ def test_what_is_broken_is_named(folder, tmp_path, verified, name, how, what):
         assert f"{folder / name} " in str(rejection.value)
 
 
+@pytest.mark.parametrize("key", ["status", "asked", "config", "sha256"])
+def test_a_seeds_json_that_lacks_an_entry_is_broken(folder, verified, key):
+    path = folder / "seed_0001.json"
+    document = json.loads(path.read_text())
+    del document[key], document[files.DIGEST]
+    path.write_text(files.sealed(document))
+    code, lines = verified()
+    assert code == 2 and lines[0].startswith(f"broken: {path.with_suffix('')}.")
+    assert f"delete {path.with_suffix('')}.*" in lines[0]
+
+
 #: Tables that were recorded as they are, and yet can't be right.
 TABLES = [
     (lambda t: t[:0], "has no rows"),
@@ -165,7 +178,8 @@ def test_what_is_incomplete_is_named(folder, tmp_path, verified, pattern, how, w
     code, lines = verified()
     assert code == 1 and lines[-1].endswith("complete; 1 incomplete")
     assert lines[0].startswith(f"incomplete: {folder}") and what in lines[0]
-    assert ("`bcrl env=car_on_hill`" in lines[0]) == ("lacks" in what)
+    assert ("`bcrl env=car_on_hill`" in lines[0]) == ("no seeds" not in what)
+    assert ("wait" in lines[0]) == ("running" in what)
     with pytest.raises(BcrlError, match="--allow-incomplete"):
         load_runs(tmp_path, "smoke")
 

@@ -10,7 +10,6 @@ import yaml
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bcrl.common.divergence import diverging
 from bcrl.report.figures import style
 from bcrl.report.statistics import bootstrap_curves, standard_error
 from bcrl.report.variants import Methods, Runs, Variant
@@ -73,7 +72,7 @@ def draw_metric(
         else:
             axes.plot(x, values.T, **_SEEDS, color=line["color"])
         axes.plot(x, mean, linewidth=1.6 if interval else 2.0, **line)
-        if metric in diverging(variant.metrics):
+        if metric in variant.far:
             far.append(name)
         else:
             within += drawn

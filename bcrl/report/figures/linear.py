@@ -18,7 +18,6 @@ _WORST = -150.0  # target return of a policy that never succeeds: −1 in 150 st
 _APART = 0.18  # share of the axis below which neighbouring labels take two rows
 _EVERY = 4  # grid points per arrow
 _SMALL = style.SMALL | {"fontsize": 6.5}
-NO_RUNS = {"ha": "center", "va": "center", "color": "0.5"}
 
 
 def _pretraining_rows(variant: Variant) -> np.ndarray:
@@ -72,7 +71,7 @@ def _draw_pretraining(axes: Axes, methods: Methods) -> None:
     if handles:
         axes.legend(handles=handles, loc="lower right", fontsize=7)
     else:
-        axes.text(0.5, 0.5, "no pretraining", transform=axes.transAxes, **NO_RUNS)
+        axes.text(0.5, 0.5, "no pretraining", transform=axes.transAxes, **style.EMPTY)
     axes.set_ylabel("discounted return in the LQ task")
     axes.set_title("pretraining", pad=3)
 
@@ -109,7 +108,7 @@ def _draw_prior(axes: Axes, learner: str, variant: Variant | None) -> None:
     if variant is None:
         axes.set_title(title, pad=4)
         axes.set(xlim=(-5, 5), ylim=(-5, 5))
-        axes.text(0, 0, "no runs", **NO_RUNS)
+        axes.text(0, 0, "no runs", **style.EMPTY)
         return
     wished = _SHOWN_SEED[learner]
     seed = wished if wished in variant.seeds else min(variant.seeds)
@@ -131,21 +130,18 @@ def _draw_environment(axes: Axes, variant: Variant) -> None:
     axes.set(xlim=(x0 - margin, x1 + margin), ylim=(y0 - length / 3, y1 + length / 3))
     axes.set_title("target task", pad=4)
     axes.set_facecolor("0.88")
-    strip = {"facecolor": "white", "edgecolor": "none"}
-    axes.add_patch(Rectangle((x0, y0), length, y1 - y0, **strip))
+    axes.add_patch(Rectangle((x0, y0), length, y1 - y0, fc="white", ec="none"))
     axes.hlines([y0, y1], x0, x1, color="0.5", linewidth=0.8, linestyle=(0, (3, 2)))
     axes.vlines([x0, x1], *axes.get_ylim(), color="black", linewidth=2.2)
-    place = {"facecolor": style.colour("B"), "edgecolor": "black"}
-    axes.add_patch(Circle(goal[:2], goal[2], **place))
-    place = {"facecolor": style.colour("SC"), "edgecolor": style.colour("DQN")}
-    size = start[2:] - start[:2]
-    axes.add_patch(Rectangle(start[:2], *size, linewidth=2, zorder=3, **place))
+    axes.add_patch(Circle(goal[:2], goal[2], fc=style.colour("B"), ec="black"))
+    look = {"fc": style.colour("SC"), "ec": style.colour("DQN"), "lw": 2, "zorder": 3}
+    axes.add_patch(Rectangle(start[:2], *(start[2:] - start[:2]), **look))
     middle, speed, top = (x0 + x1) / 2, float(np.hypot(*drift)), axes.get_ylim()[1]
     names = [("goal", goal[0]), ("start", (start[0] + start[2]) / 2)]
     if speed > 0:
         axes.quiver(middle, (y0 + y1) / 2, *(drift / speed), scale=6, width=0.012)
         names.append((f"drift {speed:g}", middle))
-    small = {"fontsize": 6.5, "xycoords": "data", "textcoords": "offset points"}
+    small = {"fontsize": 6.5, "textcoords": "offset points"}
     for name, x in names:
         axes.annotate(name, (x, y1), (0, 2), ha="center", va="bottom", **small)
     for text, at, shift, side in (

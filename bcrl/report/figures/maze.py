@@ -8,7 +8,6 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Rectangle
 
 from bcrl.report.figures import style
-from bcrl.report.figures.linear import NO_RUNS
 from bcrl.report.variants import METHODS, Methods, Runs, Variant
 
 _MARGIN = 0.025  # half a lattice cell
@@ -67,7 +66,7 @@ def _grid(panel: SubFigure, methods: Methods) -> Iterator[tuple[Axes, str, Varia
             yield axes, name, methods[name]
         else:
             _frame(axes, name)
-            axes.text(0.5, 0.5, "no runs", **NO_RUNS)
+            axes.text(0.5, 0.5, "no runs", **style.EMPTY)
 
 
 def figure_3(runs: Runs, tag: str | None = None) -> Figure:

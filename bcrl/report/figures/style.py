@@ -34,6 +34,7 @@ COLOURS = {
 _BANDS = ("#EBEBEB", "#F8F8F8")
 OPTIMUM = {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 1.0}
 SMALL = {"color": "0.35", "textcoords": "offset points"}  # labels beside what they name
+EMPTY = {"color": "0.5", "ha": "center", "va": "center"}  # words on empty axes
 
 _DPI = 150
 TEXT_WIDTH = 7.2  # inches, a full text width
@@ -51,10 +52,8 @@ def sheet() -> AbstractContextManager[None]:
 
 def colour(method: str) -> str:
     """A method's colour by its prefix: `BC-FQI` and `BC-DQN` look alike."""
-    if method in COLOURS:
-        return COLOURS[method]
-    prefix, dash, _ = method.rpartition("-")
-    return COLOURS.get(prefix, COLOURS["PPR"]) if dash else COLOURS[""]
+    prefix = method if method in COLOURS else method.rpartition("-")[0]
+    return COLOURS.get(prefix, COLOURS["PPR"])
 
 
 def dashed(method: str) -> bool:
@@ -68,8 +67,7 @@ def line_of(method: str) -> dict[str, Any]:
 
 
 def task_spans(variant: Variant) -> list[Span]:
-    """Name and extent, on the axis of iterations or steps, of every task of a variant.
-    An iteration reaches half a one to either side; steps continue across tasks."""
+    """Name and extent of a variant's tasks, on the axis of iterations or steps."""
     task, steps = variant.task, variant.index
     edges = np.arange(len(task) + 1) + 0.5
     if variant.family == "DQN":
@@ -120,8 +118,7 @@ def legend(figure: Figure, methods: Iterable[str], optimum: bool = False) -> Non
 def footer(
     figure: Figure, runs: Runs, methods: Methods, what: str, compares: bool = True
 ) -> None:
-    """Small print: environment, scale, number of seeds, `what` is drawn, what is odd.
-    `compares`: differences between methods belong to it."""
+    """Small print: environment, scale, number of seeds, `what` is drawn, `remarks`."""
     env, *_ = (v.env for v in methods.values())
     counts = [len(v.seeds) for v in methods.values()]
     n = "–".join(map(str, sorted({min(counts), max(counts)})))
