@@ -73,7 +73,7 @@ def torment(words: tuple[str, ...], folder: Path, rng: random.Random, kills: int
     began = time.monotonic()
     while done < kills and time.monotonic() < began + LIMIT:
         rounds += 1
-        p = plan(*words, f"runs_dir={folder / str(rounds)}", "checkpoint_every=0.01")
+        p = plan(*words, f"runs_dir={folder / str(rounds)}", "checkpoint_every=0.1")
         while True:
             if within := rng.random() < 0.3:  # in the middle of a write
                 child = forked(partial(run_until_write, p, rng.randint(1, writes)))

@@ -181,7 +181,7 @@ def test_each_seed_is_computed_once_by_racing_processes(tmp_path, processes):
 
 
 LONG = ("env=maze", "curriculum=on", "boosting=on", "tag=x", "seeds.count=2")
-LONG += ("seeds.lockstep=1", "algorithm.iterations=40", "threads=1")
+LONG += ("seeds.lockstep=1", "algorithm.iterations=15", "threads=1")
 #: A shell's background jobs, and so perhaps this test, ignore SIGINT from the start.
 PROGRAM = """
 import signal, sys
