@@ -46,10 +46,7 @@ def write_text(path: Path, text: str) -> Path:
 
 
 def user_folder(variable: str, usual: str) -> Path | None:
-    """A folder of the user's: XDG's `variable` if absolute, else `usual` at home.
-
-    None where no home is known: `~` never names a folder.
-    """
+    """The user's folder: XDG's `variable` if absolute, else `usual` at home, if known."""
     for place in (os.environ.get(variable, ""), f"~/{usual}"):
         if os.path.isabs(folder := os.path.expanduser(place)):
             return Path(folder)

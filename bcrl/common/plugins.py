@@ -62,10 +62,7 @@ def is_trusted(name: str) -> bool:
 
 
 def module(key: str, name: str, where: str, known: Collection[str] = ()) -> ModuleType:
-    """The module `where`, imported; ConfigError if it can't be.
-
-    It must be trusted, or of a package that is `known`.
-    """
+    """The module `where`, trusted or `known`, imported; ConfigError if it can't be."""
     if not all(part.isidentifier() for part in where.split(".")):
         raise ConfigError(key, name, "isn't the name of a module")
     if where.partition(".")[0] not in known and not is_trusted(where):

@@ -25,10 +25,7 @@ class Stop:
 
     @contextmanager
     def on_signals(self) -> Iterator[None]:
-        """Signals request a stop; the same one again ends the process at once.
-
-        Signals that are ignored (as by nohup) stay ignored.
-        """
+        """Signals request a stop, the same one again ends all; ignored ones (nohup) stay so."""
         came = set()  # a scheduler may send two kinds, one soon after the other
 
         def note(number: int, frame: Any) -> None:

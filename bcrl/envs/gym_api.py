@@ -68,10 +68,7 @@ class GymEnv(gymnasium.Env):
 
 
 class GymVectorEnv(VectorEnv):
-    """`num_envs` episodes of one task side by side, each step one call on arrays.
-
-    The same numbers as from a SyncVectorEnv of `GymEnv`s; no pictures.
-    """
+    """`num_envs` of GymEnv side by side in one call, with the numbers of SyncVectorEnv."""
 
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 

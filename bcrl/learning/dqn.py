@@ -100,25 +100,23 @@ class DQNState:
     residual: Any = None  # (S, A) ϱ at `env_state`, if computed
 
 
+@dataclass(eq=False)
 class DQNTrainer:
     """S seeds in the middle of a stage, each with its environment and networks."""
 
-    def __init__(
-        self,
-        settings: DQN,
-        stage: Stage,
-        start: StageInit,
-        batch: SeedBatch,
-        state: Any,
-    ) -> None:
-        self.settings, self.stage = settings, stage
-        self.start, self.batch = start, batch
-        self.env, self.n_actions = stage.env, stage.env.n_actions
-        self.state = now = state or self._initial_state()
+    settings: DQN
+    stage: Stage
+    start: StageInit
+    batch: SeedBatch
+    state: Any = None  # the DQNState of a pause; None begins the stage
+
+    def __post_init__(self) -> None:
+        self.env, self.n_actions = self.stage.env, self.stage.env.n_actions
+        self.state = now = self.state or self._initial_state()
         updater = one_by_one if now.replay.rows.is_cpu else batched
         self._gradient_step = updater(now.deep, now.replay)
         self._frozen = self._frozen_at(now.env_state)  # before the present step
-        if isinstance(start.behavior, ResidualPolicy):
+        if isinstance(self.start.behavior, ResidualPolicy):
             self._combined = combined_actions(self.env.actions)
         self._block = -1  # the block whose uniforms are drawn
 

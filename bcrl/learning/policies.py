@@ -41,10 +41,7 @@ def _choices(q, explore, u, epsilon):
 def epsilon_greedy(
     q: Floats, explore: Floats, u: Floats, epsilon: Floats | float
 ) -> Integers:
-    """The action ⌊u A⌋ where `explore` (...) is below ε, elsewhere the `greedy` one.
-
-    ε: one number, or one for each last index.
-    """
+    """⌊u A⌋ where `explore` (...) < ε (one, or one per last index), else `greedy`'s."""
     rows = writable(q).reshape(-1, q.shape[-1])
     drawn = (np.array(x, np.float64, order="C").ravel() for x in (explore, u, epsilon))
     return _choices(rows, *drawn).reshape(u.shape)

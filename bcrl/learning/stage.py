@@ -35,10 +35,7 @@ class Learner(Protocol):
     def learn(
         self, stage: "Stage", start: StageInit, batch: SeedBatch, state: Any = None
     ) -> Iterator["Pause"]:
-        """Learn `stage` from `start`; yields pauses, the last one a `Snapshot`.
-
-        With the `state` of a pause it resumes there.
-        """
+        """Learn `stage`, or resume at a pause's `state`; the last pause is a Snapshot."""
 
 
 @dataclass(frozen=True)

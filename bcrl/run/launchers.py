@@ -57,10 +57,7 @@ class _SlurmJob(submitit.helpers.Checkpointable):
 
 
 def launch(plans: Sequence[Plan]) -> None:
-    """Submit what is not complete, wait until the last job ends, and check the seeds.
-
-    Raises errors as `runner.run`, and Unattended if jobs remain that can't be awaited.
-    """
+    """Submit the incomplete seeds and wait; raises as `runner.run`, and Unattended."""
     commands = ("sbatch", "srun", "squeue")
     if missing := [name for name in commands if not shutil.which(name)]:
         why = f"there is no {', '.join(missing)} here: run it on a login node"

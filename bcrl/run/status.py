@@ -35,10 +35,7 @@ def dry_run(plans: Sequence[Plan]) -> str:
 
 
 def status(arguments: Namespace) -> str:
-    """The state of all seeds of a command line, as a table.
-
-    If it names nothing but `runs_dir`, of all seeds that were ever requested there.
-    """
+    """The states of a command line's seeds, or of all in its `runs_dir`, as a table."""
     asked: list[tuple[Path, Sequence[int]]] = []
     if all(override.startswith("runs_dir=") for override in arguments.overrides):
         any_ = [*arguments.overrides, "env=maze"]  # it is a required choice

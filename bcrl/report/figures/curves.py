@@ -121,8 +121,9 @@ def figure_curves(runs: Runs, env: str, family: str, tag: str | None = None) -> 
     how = {"rows": spread_rows, "interval": bootstrap_curves}
     figure, _ = _panels(methods, labels, size, **how)
     style.legend(figure, methods)
-    style.footer(figure, runs, methods, "mean over seeds, bootstrapped 95 % interval")
-    return figure
+    return style.footer(
+        figure, runs, methods, "mean over seeds, bootstrapped 95 % interval"
+    )
 
 
 def figure_1(runs: Runs, tag: str | None = None) -> Figure:
@@ -131,8 +132,9 @@ def figure_1(runs: Runs, tag: str | None = None) -> Figure:
     labels = {metric: label("FQI", metric) for metric in ("q_error", "return")}
     figure, _ = _panels(methods, labels, (style.TEXT_WIDTH, 3.3), interval=None)
     style.legend(figure, methods)
-    style.footer(figure, runs, methods, "bold: mean over seeds, dashed: single seeds")
-    return figure
+    return style.footer(
+        figure, runs, methods, "bold: mean over seeds, dashed: single seeds"
+    )
 
 
 def figure_2(runs: Runs, tag: str | None = None) -> Figure:
@@ -153,8 +155,7 @@ def figure_2(runs: Runs, tag: str | None = None) -> Figure:
     if (optimum := optimum_of(methods)) is not None:
         panels[1].axhline(optimum, **style.OPTIMUM)
     style.legend(figure, methods, optimum=optimum is not None)
-    style.footer(figure, runs, methods, _TWO_ERRORS)
-    return figure
+    return style.footer(figure, runs, methods, _TWO_ERRORS)
 
 
 def figure_5(runs: Runs, tag: str | None = None) -> Figure:
@@ -164,5 +165,4 @@ def figure_5(runs: Runs, tag: str | None = None) -> Figure:
     figure, (axes,) = _panels(methods, labels, (0.75 * style.TEXT_WIDTH, 3.0))
     axes.axhline(0.0, color="0.6", linewidth=0.6, zorder=1.9)
     style.legend(figure, methods)
-    style.footer(figure, runs, methods, _TWO_ERRORS, compares=False)
-    return figure
+    return style.footer(figure, runs, methods, _TWO_ERRORS, compares=False)

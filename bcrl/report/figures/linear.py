@@ -90,8 +90,7 @@ def figure_4a(runs: Runs, tag: str | None = None) -> Figure:
         axes.locator_params(axis="x", nbins=6)
     style.legend(figure, methods)
     what = "mean ± 2 standard errors over seeds, exploring policy; dotted: new task"
-    style.footer(figure, runs, methods, what)
-    return figure
+    return style.footer(figure, runs, methods, what)
 
 
 def prior(variant: Variant, seed: int) -> tuple[np.ndarray, ...]:
@@ -167,5 +166,4 @@ def figure_4b(runs: Runs, tag: str | None = None) -> Figure:
     shown = {v.method: v for v in found.values()} or {variant.method: variant}
     what = "one seed per panel, own colour scales; "
     what += "arrows: greedy action at zero velocity"
-    style.footer(figure, runs, shown, what, compares=False)
-    return figure
+    return style.footer(figure, runs, shown, what, compares=False)

@@ -101,5 +101,4 @@ def figure_3(runs: Runs, tag: str | None = None) -> Figure:
         _draw_walls(axes, walls[-1])
         _draw_paths(axes, name, variant, goal)
     what = "circle: start, star: goal; in (c) seeds are drawn side by side"
-    style.footer(figure, runs, methods, what)
-    return figure
+    return style.footer(figure, runs, methods, what)

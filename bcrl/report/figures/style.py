@@ -117,8 +117,8 @@ def legend(figure: Figure, methods: Iterable[str], optimum: bool = False) -> Non
 
 def footer(
     figure: Figure, runs: Runs, methods: Methods, what: str, compares: bool = True
-) -> None:
-    """Small print: environment, scale, number of seeds, `what` is drawn, `remarks`."""
+) -> Figure:
+    """The figure with small print: environment, seeds, `what` is drawn, `remarks`."""
     env, *_ = (v.env for v in methods.values())
     counts = [len(v.seeds) for v in methods.values()]
     n = "–".join(map(str, sorted({min(counts), max(counts)})))
@@ -128,6 +128,7 @@ def footer(
     limit = int(figure.get_figwidth() * _FOOTER_WIDTH)
     text = "\n".join(part for line in lines for part in textwrap.wrap(line, limit))
     figure.supxlabel(text, x=0.01, ha="left", fontsize=6.5, color="0.35")
+    return figure
 
 
 def colour_bar(axes: Axes, image: Any, shrink: float, aspect: float) -> Any:
