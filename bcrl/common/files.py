@@ -46,7 +46,7 @@ def write_text(path: Path, text: str) -> Path:
 
 
 def user_folder(variable: str, usual: str) -> Path | None:
-    """The user's folder: XDG's `variable` if absolute, else `usual` at home, if known."""
+    """The folder XDG's `variable` names if absolute, else `usual` at home; or None."""
     for place in (os.environ.get(variable, ""), f"~/{usual}"):
         if os.path.isabs(folder := os.path.expanduser(place)):
             return Path(folder)

@@ -25,7 +25,7 @@ class Stop:
 
     @contextmanager
     def on_signals(self) -> Iterator[None]:
-        """Signals request a stop, the same one again ends all; ignored ones (nohup) stay so."""
+        """Signals, unless ignored (nohup), request a stop; the same again ends all."""
         came = set()  # a scheduler may send two kinds, one soon after the other
 
         def note(number: int, frame: Any) -> None:

@@ -68,7 +68,7 @@ class GymEnv(gymnasium.Env):
 
 
 class GymVectorEnv(VectorEnv):
-    """`num_envs` of GymEnv side by side in one call, with the numbers of SyncVectorEnv."""
+    """`num_envs` of `GymEnv` in one call, with the numbers of a SyncVectorEnv."""
 
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 

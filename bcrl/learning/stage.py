@@ -35,7 +35,7 @@ class Learner(Protocol):
     def learn(
         self, stage: "Stage", start: StageInit, batch: SeedBatch, state: Any = None
     ) -> Iterator["Pause"]:
-        """Learn `stage`, or resume at a pause's `state`; the last pause is a Snapshot."""
+        """Learn `stage`, or resume at a pause's `state`; the last is a Snapshot."""
 
 
 @dataclass(frozen=True)
