@@ -69,13 +69,9 @@ def test_help_and_tab_import_nothing_large(tmp_path):
             print(sorted(large & sys.modules.keys()), file=sys.stderr)
     """
     for asked in (["--help"], ["-sc", "query=bash"]):
-        done = subprocess.run(
-            [sys.executable, "-c", program, *asked],
-            env={**os.environ, "COMP_LINE": "bcrl env="},
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-        )
+        command = [sys.executable, "-c", program, *asked]
+        there = {"cwd": tmp_path, "env": {**os.environ, "COMP_LINE": "bcrl env="}}
+        done = subprocess.run(command, **there, capture_output=True, text=True)
         assert done.stdout and done.stderr == "[]\n"
 
 

@@ -13,13 +13,9 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 def lines(name: str, tmp_path: Path) -> list[list[str]]:
     """The cells of each line that an example prints."""
-    done = subprocess.run(
-        [sys.executable, EXAMPLES / f"{name}.py"],
-        cwd=tmp_path,
-        env={**os.environ, "COLUMNS": "200"},
-        capture_output=True,
-        text=True,
-    )
+    command = [sys.executable, EXAMPLES / f"{name}.py"]
+    there = {"cwd": tmp_path, "env": {**os.environ, "COLUMNS": "200"}}
+    done = subprocess.run(command, **there, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert not list(tmp_path.iterdir())  # a script leaves no files
     return [line.split() for line in done.stdout.splitlines()]

@@ -27,13 +27,8 @@ def test_the_dataset_is_the_episodes_with_repetitions_counted(env):
     seen = (state[:, :-1], state[:, 1:], *(x[0] for x in outcomes))
     expected = rows(*(x[kept] for x in seen))
     again = np.repeat(np.arange(len(d.state)), d.multiplicity)
-    stored = (
-        d.points[d.state],
-        d.points[d.next_state],
-        d.action,
-        d.reward,
-        d.absorbing,
-    )
+    stored = (d.points[d.state], d.points[d.next_state])
+    stored += (d.action, d.reward, d.absorbing)
     assert rows(*(x[again] for x in stored)) == expected
     if env.finite:
         assert len(d.state) <= 10 < len(expected)  # the corridor repeats itself

@@ -186,25 +186,19 @@ def test_true_claims_hold_and_false_ones_do_not(tmp_path, curves):
     if curves is as_claimed:
         assert {*car.values(), *maze.values()} == {"holds"}
         return
-    for claim in (
-        "BC-FQI ends with a larger return than FQI",
-        "FQI never solves the target",
-        "BC-FQI's residual at s0 shrinks from T1 to T6",
-        "most seeds of BC-FQI end at the optimum",
-    ):
-        assert maze[claim] == "does not hold"
+    assert maze["BC-FQI ends with a larger return than FQI"] == "does not hold"
+    assert maze["FQI never solves the target"] == "does not hold"
+    assert maze["BC-FQI's residual at s0 shrinks from T1 to T6"] == "does not hold"
+    assert maze["most seeds of BC-FQI end at the optimum"] == "does not hold"
     assert car["C-FQI's error rises on the target task"] == "does not hold"
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "expect", "expected"),
-    [
-        (-1.0, 1.0, "< 0", "undecided"),
-        (-1.0, 0.0, "≤ 0", "holds"),
-        (0.0, 1.0, "< 0", "does not hold"),
-        (0.4, 0.9, "> ½", "undecided"),
-    ],
-)
+#: An interval, what is expected of the value, and the verdict.
+VERDICTS = [(-1.0, 1.0, "< 0", "undecided"), (-1.0, 0.0, "≤ 0", "holds")]
+VERDICTS += [(0.0, 1.0, "< 0", "does not hold"), (0.4, 0.9, "> ½", "undecided")]
+
+
+@pytest.mark.parametrize(("low", "high", "expect", "expected"), VERDICTS)
 def test_verdicts(low, high, expect, expected):
     value = (low + high) / 2
     assert verdict(value, (low, high), expect, seeds=5) == expected
