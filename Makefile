@@ -4,8 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 SCALE ?= quick
-PYTEST = $(BIN)/python -m pytest --numprocesses 2
-FAST_TESTS = $(PYTEST) -m "not slow and not slurm and not browser"
+PYTEST := $(BIN)/python -m pytest
+FAST_TESTS := $(PYTEST) --numprocesses 2 -m "not slow and not slurm and not browser"
 WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 
 # Without bytecode each process would compile all of torch again.
@@ -55,7 +55,7 @@ test: $(READY) ## the fast tests (about 4 minutes on two cores)
 # Slow tests stay out of the coverage, which would double their time.
 test-all: $(READY) ## all tests, with the fast ones' coverage of the package
 	$(FAST_TESTS) --cov=bcrl --cov-report=term --cov-fail-under=90
-	$(PYTEST) -m "slow or slurm or browser"
+	$(PYTEST) --numprocesses 3 -m "slow or slurm or browser"  # some of them wait
 
 lint: $(READY) ## style, spelling, layers of imports, types
 	$(BIN)/ruff check .

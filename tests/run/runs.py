@@ -24,6 +24,7 @@ DQN += ("algorithm.evaluation_episodes=3", "tag=x")
 METHODS = ("plain", "C", "BC", "SC", "SBC", "RPL", "PPR")
 METHODS += ("BC_released", "SC_released", "SBC_released")
 HILL = ("env=car_on_hill", *FQI, "tag=x")
+SHORT = (*HILL, "env.horizon=20")
 SMALL = tuple(word for word in DQN if word != "env=linear_system")
 CART = ("env.horizon=90", "scale.max_steps=150", "algorithm.learning_starts=60")
 #: Every variant of the paper, and others; RPL's offset is shorter than the run.
@@ -40,8 +41,8 @@ KINDS |= {
     "dqn in gymnasium": ("env=cart_pole", *SMALL, "variant=SBC", *CART),
     "fqi on the system": ("env=linear_system", "variant=BC", *FQI),
     "fqi in gymnasium": ("env=acrobot", "variant=BC", *FQI, "env.horizon=15"),
-    "sklearn's forest": (*HILL, "variant=BC", "algorithm/regressor=sklearn_forest"),
-    "sklearn by name": (*HILL, "variant=C", "algorithm/regressor=sklearn"),
+    "sklearn's forest": (*SHORT, "variant=BC", "algorithm/regressor=sklearn_forest"),
+    "sklearn by name": (*SHORT, "variant=C", "algorithm/regressor=sklearn"),
     "the same data": (*HILL, "variant=B", "algorithm.dataset=shared"),
 }
 KINDS["the same data"] += ("algorithm.new_data=task",)
