@@ -48,12 +48,12 @@ def now(pattern: str) -> str:
     return STARTED.strftime(pattern)
 
 
+@cache
 def register_plugins() -> None:
     """Make the schema known to Hydra, and how folders of configs are read."""
     ConfigStore.instance().store(name="schema", node=schema.Config)
     for plugin in (safety.ConfigFolder, safety.OwnSearchPath):
         Plugins.instance().register(plugin)
-    OmegaConf.register_new_resolver("now", now, replace=True)
 
 
 def searchpath(folders: Paths) -> list[str]:
@@ -71,7 +71,7 @@ def composed(
     register_plugins()
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
-            register_plugins()  # once more: Hydra has its own `now`
+            OmegaConf.register_new_resolver("now", now, replace=True)  # not Hydra's
             asked = [*overrides, *searchpath(folders)]
             return compose(name, asked, return_hydra_config=True)
     except BcrlError:

@@ -22,7 +22,7 @@ VARIANTS = {
     "linear_system/DQN": DQN_METRICS,
 }
 SEEDS = 2
-TRIES = 48  # of each kind
+TRIES = 24  # of each kind
 Rng = np.random.Generator
 
 
