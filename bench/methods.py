@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from bcrl.config import jobs
 from bcrl.config.plan import Plan
 from bcrl.evaluation.step_metrics import evaluate
-from bcrl.learning.dqn import DQNTrainer
+from bcrl.learning.dqn_trainer import DQNTrainer
 from bcrl.learning.stage import SeedBatch, learn
 from bcrl.learning.transfer import begin
 

@@ -47,6 +47,7 @@ LIGHT = {
     "bcrl": HEAVY | {"numpy", "pandas", "scipy", "sklearn", "gymnasium"},
     "bcrl.results.verify": HEAVY,
     "bcrl.report.cli": HEAVY,
+    "bcrl.run.runner": {"torch", "sklearn", "gymnasium", "matplotlib"},
 }
 
 

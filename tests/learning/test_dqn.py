@@ -10,7 +10,8 @@ from threadpoolctl import threadpool_limits
 from bcrl.api import Boost, PolicyReuse, ResidualPolicy, Shape, warm_start
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.evaluation.step_metrics import evaluate
-from bcrl.learning.dqn import DQN, DQNTrainer
+from bcrl.learning.dqn import DQN
+from bcrl.learning.dqn_trainer import DQNTrainer
 from bcrl.learning.lspi import LSPI
 from bcrl.learning.replay import Replay
 from bcrl.learning.transfer import StageInit, StageResult, begin

@@ -12,7 +12,8 @@ from bcrl.api import Boost, PolicyReuse, ResidualPolicy, Shape, warm_start
 from bcrl.common.seeding import stream
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.errors import ConfigError
-from bcrl.learning.dqn import CHOICES, DQN, DRAW_BLOCK, DQNTrainer
+from bcrl.learning.dqn import DQN
+from bcrl.learning.dqn_trainer import CHOICES, DRAW_BLOCK, DQNTrainer
 from bcrl.learning.policies import combined_actions
 from bcrl.learning.transfer import StageInit, StageResult, begin
 from bcrl.q.functions import ZERO, Sum
