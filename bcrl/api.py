@@ -32,7 +32,7 @@ from bcrl.learning.transfer import Boost, PolicyReuse, ResidualPolicy, Shape, wa
 from bcrl.q.regressors.ours import ForestRegressor as Forest
 from bcrl.q.regressors.ours import Tabular
 from bcrl.q.regressors.scikit import Sklearn
-from bcrl.results.read import read_folder as read
+from bcrl.results.tables import read_folder as read
 from bcrl.run.workers import cores
 
 __all__ = ["CarOnHill", "Gymnasium", "LinearSystem", "Maze", "read", "run", "stages"]
@@ -60,8 +60,7 @@ def stages(
     others = [t for t in transfers if not isinstance(t, Boost) and t is not warm_start]
     _check(tasks, transfers, max(len(boosts), len(others)))
     if curriculum is None:
-        earlier = dict.fromkeys(task for task in tasks if task != tasks[-1])
-        different = [*earlier, tasks[-1]]
+        different = [*dict.fromkeys(t for t in tasks if t != tasks[-1]), tasks[-1]]
         order = tuple(different.index(task) for task in tasks)
     else:
         different, order = tasks, order_of(curriculum, tasks)

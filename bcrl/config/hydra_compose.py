@@ -23,7 +23,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 #: In a wheel the configs lie inside the package, in a checkout beside it.
 CONF = next(p for p in (PACKAGE / "conf", PACKAGE.parent / "conf") if p.is_dir())
 CONFIG_NAME = "config"
-STARTED = datetime.now()
+STARTED = datetime.now()  # `${now:%H-%M}`, one time in all jobs of a command
 #: Hydra's messages about a key that can't be overridden, added or deleted.
 UNKNOWN = re.compile(
     r"Could not override '([^']+)'|Could not append.* already at '([^']+)'"
@@ -41,11 +41,6 @@ class Unknown(BcrlError):
     def __init__(self, text: str, key: str, option: str | None = None) -> None:
         super().__init__(text)
         self.key, self.option = key, option
-
-
-def now(pattern: str) -> str:
-    """`${now:%H-%M}`: when the command began, one time in all of its jobs."""
-    return STARTED.strftime(pattern)
 
 
 @cache
@@ -71,7 +66,7 @@ def composed(
     register_plugins()
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
-            OmegaConf.register_new_resolver("now", now, replace=True)  # not Hydra's
+            OmegaConf.register_new_resolver("now", STARTED.strftime, replace=True)
             asked = [*overrides, *searchpath(folders)]
             return compose(name, asked, return_hydra_config=True)
     except BcrlError:

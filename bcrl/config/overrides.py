@@ -14,7 +14,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
 from bcrl.common.terminal import say
-from bcrl.config.hydra_compose import Paths, catalog, first_lines, now
+from bcrl.config.hydra_compose import STARTED, Paths, catalog, first_lines
 from bcrl.config.safety import check_override
 from bcrl.config.schema import TEXTS, section_of_seeds
 from bcrl.errors import BcrlError, ConfigError
@@ -60,7 +60,7 @@ def canonical(overrides: Sequence[str], folders: Paths) -> list[str]:
 
 
 def _canonical(text: str, groups: dict[str, list[str]]) -> Iterator[str]:
-    text = NOW.sub(lambda found: now(found[1]), text)
+    text = NOW.sub(lambda found: STARTED.strftime(found[1]), text)
     (override,) = parse([text])
     key, value = override.key_or_group, override.value()
     head, equals, raw = text.partition("=")

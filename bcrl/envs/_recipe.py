@@ -79,10 +79,7 @@ class Recipe:
 
 
 def spec_of(name: str) -> EnvSpec:
-    """The registered environment `name`; ConfigError if there is none.
-
-    `module:Name-v0` imports the module first: one of PACKAGES or of BCRL_TRUST.
-    """
+    """The environment `name`; `module:Name-v0` imports first; ConfigError if none."""
     module, _, plain = name.rpartition(":")
     if module and (module not in PACKAGES or find_spec(module)):
         plugins.module("env.id", name, module, PACKAGES)

@@ -108,10 +108,7 @@ class Lanes:
         return start
 
     def step(self, state: Any, action: NDArray, noise: Any, lanes: Any = ...) -> tuple:
-        """Next states, rewards and ends in the chosen lanes, and which are cut.
-
-        Actions (...) are for the environment's `step`, forces (..., k) for its `push`.
-        """
+        """What `step` (`push` for forces) gives in chosen lanes, and which are cut."""
         step = self.env.push if action.ndim == state.ndim else self.env.step
         return *step(state, action, noise), False
 
@@ -124,10 +121,7 @@ class Lanes:
 
 
 class SimulatedEnv(Env, Protocol):
-    """An environment with a hidden state: `initial` gives the numbers that reset lanes.
-
-    Each `state` is an observation. The reset seeds all randomness.
-    """
+    """Simulators with hidden states: `initial` gives the numbers that reset lanes."""
 
     starts: int  # random resets from which FQI's greedy policy is evaluated
 

@@ -15,6 +15,7 @@ from bcrl.common.identity import differences, identity
 from bcrl.results import layout, read
 from bcrl.results.layout import requested, seed_path, state_of
 from bcrl.results.read import AGAIN, INCOMPLETE, Document, Finding
+from bcrl.results.tables import parsed
 
 _SHOWN_KEYS = 3  # differing keys of a config that are named
 _NAME = re.compile(rf"{layout.SEED}([0-9]+)\.({'|'.join(layout.SUFFIXES)})")
@@ -78,7 +79,7 @@ def check_folder(folder: Path) -> Checked:
                 read.read_recorded(npz, document)
                 data = read.read_recorded(csv, document)
                 if complete:
-                    tables[seed] = read.parsed(csv, data, document)
+                    tables[seed] = parsed(csv, data, document)
         except Finding as finding:
             findings.append(finding)
     findings += [*_config_findings(folder, documents), *_index_findings(folder, tables)]

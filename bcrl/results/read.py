@@ -1,13 +1,11 @@
 """One seed's three files, each read only if it is what the run recorded."""
 
-import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from bcrl.common.files import is_intact, sha256
@@ -76,45 +74,6 @@ def read_recorded(path: Path, document: Document) -> bytes:
     return data
 
 
-def parsed(path: Path, data: bytes, document: Document) -> pd.DataFrame:
-    """The table of a complete seed's CSV; Finding unless all its columns are sound."""
-    try:
-        table = pd.read_csv(io.BytesIO(data), dtype=float)
-    except ValueError as error:
-        raise Finding(path, f"is not a readable CSV of numbers ({error})") from error
-    family = layout.family_of(table)
-    metrics, finite = layout.DQN_METRICS, {*layout.DQN_METRICS} - {*layout.MAY_BE_NAN}
-    if family == "FQI":
-        metrics = tuple(dict.fromkeys(document["config"]["env"]["metrics"]))
-        finite = {*layout.FQI_METRICS.get(document["env"], ())}
-    expected = [str(column) for column in (*layout.INDEX[family], *metrics)]
-    if list(table.columns) != expected:
-        found = ",".join(table.columns)
-        raise Finding(path, f"has the header {found}, expected {','.join(expected)}")
-    if what := _disorder(table):
-        raise Finding(path, what)
-    checked = [name for name in expected if name in finite]
-    for column, row in np.argwhere(~np.isfinite(table[checked].to_numpy(float).T)):
-        raise Finding(path, f"has a non-finite {checked[column]} in row {row + 1}")
-    return table
-
-
-def _disorder(table: pd.DataFrame) -> str:
-    """What is wrong with a table's index columns; empty if nothing is."""
-    if table.empty:
-        return "has no rows"
-    count = np.arange(1, len(table) + 1)
-    if not np.array_equal(table.get("iteration", count), count):
-        return f"does not count iterations 1 to {len(table)}"
-    for column, least in (("step", 0), ("stage", 1), ("task", 1)):
-        values = table.get(column, pd.Series([least]))
-        if not ((values >= least) & (values % 1 == 0)).all():
-            return f"has a {column} that is not a whole number ≥ {least}"
-        if column != "task" and (np.diff(values) < 0).any():
-            return f"has {column}s that fall"
-    return ""
-
-
 def read_arrays(path: Path, *names: str) -> list[NDArray[Any]]:
     """The named arrays of an NPZ; Finding if it does not hold them."""
     try:
@@ -124,12 +83,3 @@ def read_arrays(path: Path, *names: str) -> list[NDArray[Any]]:
         raise Finding(path, f"lacks what is needed ({error.args[0]})") from error
     except Exception as error:  # whatever NumPy's readers raise
         raise Finding(path, "is not a readable NPZ") from error
-
-
-def read_folder(folder: str | Path) -> pd.DataFrame:
-    """All CSVs in a variant's folder, unchecked, with a column `seed`, or BcrlError."""
-    numbers = layout.recorded_seeds(Path(folder), "csv")
-    if not numbers:
-        raise BcrlError(f"{folder}: there is no seed_*.csv")
-    found = {n: pd.read_csv(layout.seed_path(Path(folder), n, "csv")) for n in numbers}
-    return pd.concat(found, names=["seed"]).reset_index("seed").reset_index(drop=True)

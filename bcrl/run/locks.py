@@ -28,10 +28,7 @@ class Lock:
         self._file: os.stat_result | None = None
 
     def acquire(self, seconds: float = 0.0) -> bool:
-        """Take the lock within `seconds`; False if another process keeps it.
-
-        Half-written files of a dead process are removed. BcrlError if locking fails.
-        """
+        """Take the lock in `seconds`; False if another has it, BcrlError on errors."""
         try:
             self._lock.acquire(timeout=seconds)
         except Timeout:

@@ -5,8 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from bcrl.config import jobs
 from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
@@ -71,5 +69,7 @@ def diverging_lines(plan: Plan) -> list[str]:
 
 def _table(rows: dict[str, list[Any]], *columns: str) -> str:
     """Rows by name as aligned lines."""
+    import pandas as pd  # slow to import
+
     table = pd.DataFrame.from_dict(rows, orient="index", columns=list(columns))
     return table.to_string(float_format="{:.1f}".format)

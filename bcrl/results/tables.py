@@ -1,0 +1,59 @@
+"""A seed's CSV as a table, checked, and those of a folder as they are."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from bcrl.errors import BcrlError
+from bcrl.results import layout
+from bcrl.results.read import Document, Finding
+
+
+def parsed(path: Path, data: bytes, document: Document) -> pd.DataFrame:
+    """The table of a complete seed's CSV; Finding unless all its columns are sound."""
+    try:
+        table = pd.read_csv(io.BytesIO(data), dtype=float)
+    except ValueError as error:
+        raise Finding(path, f"is not a readable CSV of numbers ({error})") from error
+    family = layout.family_of(table)
+    metrics, finite = layout.DQN_METRICS, {*layout.DQN_METRICS} - {*layout.MAY_BE_NAN}
+    if family == "FQI":
+        metrics = tuple(dict.fromkeys(document["config"]["env"]["metrics"]))
+        finite = {*layout.FQI_METRICS.get(document["env"], ())}
+    expected = [str(column) for column in (*layout.INDEX[family], *metrics)]
+    if list(table.columns) != expected:
+        found = ",".join(table.columns)
+        raise Finding(path, f"has the header {found}, expected {','.join(expected)}")
+    if what := _disorder(table):
+        raise Finding(path, what)
+    checked = [name for name in expected if name in finite]
+    for column, row in np.argwhere(~np.isfinite(table[checked].to_numpy(float).T)):
+        raise Finding(path, f"has a non-finite {checked[column]} in row {row + 1}")
+    return table
+
+
+def _disorder(table: pd.DataFrame) -> str:
+    """What is wrong with a table's index columns; empty if nothing is."""
+    if table.empty:
+        return "has no rows"
+    count = np.arange(1, len(table) + 1)
+    if not np.array_equal(table.get("iteration", count), count):
+        return f"does not count iterations 1 to {len(table)}"
+    for column, least in (("step", 0), ("stage", 1), ("task", 1)):
+        values = table.get(column, pd.Series([least]))
+        if not ((values >= least) & (values % 1 == 0)).all():
+            return f"has a {column} that is not a whole number ≥ {least}"
+        if column != "task" and (np.diff(values) < 0).any():
+            return f"has {column}s that fall"
+    return ""
+
+
+def read_folder(folder: str | Path) -> pd.DataFrame:
+    """All CSVs in a variant's folder, unchecked, with a column `seed`, or BcrlError."""
+    numbers = layout.recorded_seeds(Path(folder), "csv")
+    if not numbers:
+        raise BcrlError(f"{folder}: there is no seed_*.csv")
+    found = {n: pd.read_csv(layout.seed_path(Path(folder), n, "csv")) for n in numbers}
+    return pd.concat(found, names=["seed"]).reset_index("seed").reset_index(drop=True)
