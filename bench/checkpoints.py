@@ -10,9 +10,8 @@ import json
 import sys
 import tempfile
 import time
-from argparse import Namespace
 
-from bcrl.config import jobs
+from bcrl.config import flags, jobs
 from bcrl.results.layout import seed_path
 from bcrl.run import checkpoints, runner
 
@@ -46,13 +45,8 @@ def main(every: str = "60") -> None:
     for name, choice in CHOICES.items():
         with tempfile.TemporaryDirectory() as folder:
             more = [f"runs_dir={folder}", "progress=none", f"checkpoint_every={every}"]
-            asked = Namespace(
-                overrides=[*choice, *more],
-                multirun=False,
-                config_dir=None,
-                config_name=None,
-            )
-            (plan,) = jobs.plans(asked)
+            sys.argv = ["bcrl", *choice, *more]
+            (plan,) = jobs.plans(flags.arguments())
             timed = Timed(checkpoints.save_checkpoint)
             checkpoints.save_checkpoint = timed
             runner.run(plan)

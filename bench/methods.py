@@ -9,14 +9,14 @@ step. The first line says how fast this core multiplies the update's matrices me
 
 from __future__ import annotations
 
+import sys
 import time
-from argparse import Namespace
 
 import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from bcrl.config import jobs
+from bcrl.config import flags, jobs
 from bcrl.config.plan import Plan
 from bcrl.evaluation.step_metrics import evaluate
 from bcrl.learning.dqn_trainer import DQNTrainer
@@ -31,9 +31,8 @@ def planned(variant: str) -> Plan:
     """The method's plan, its pretraining in LQ cut short."""
     choice = ["env=linear_system", "algorithm=dqn", f"variant={variant}"]
     choice += ["algorithm.steps=[600,30000]"] * (variant == "C")
-    (plan,) = jobs.plans(
-        Namespace(overrides=choice, multirun=False, config_dir=None, config_name=None)
-    )
+    sys.argv = ["bcrl", *choice]
+    (plan,) = jobs.plans(flags.arguments())
     return plan
 
 
