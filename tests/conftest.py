@@ -36,6 +36,11 @@ def _trusts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(plugins.VARIABLE, "")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests on Slurm come first: others run while they wait."""
+    items.sort(key=lambda item: item.get_closest_marker("slurm") is None)
+
+
 def arguments(*overrides: str, multirun=False, config_dir=None) -> Namespace:
     """What `bcrl *overrides` parses to."""
     words = {"overrides": list(overrides), "multirun": multirun}
