@@ -21,7 +21,8 @@ methods = {
     "BC-FQI": stages(tasks, learner, Boost()),
 }
 frames = {
-    name: run(each, seeds=range(2), progress=False) for name, each in methods.items()
+    name: run(each, seeds=range(2), progress=False, evaluate_every=15)
+    for name, each in methods.items()
 }
 results = pd.concat(frames, names=["method", "row"])
 

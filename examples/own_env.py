@@ -51,7 +51,8 @@ methods = {
     "BC-FQI": stages(tasks, learner, Boost()),
 }
 frames = {
-    name: run(each, seeds=range(3), progress=False) for name, each in methods.items()
+    name: run(each, seeds=range(3), progress=False, evaluate_every=15)
+    for name, each in methods.items()
 }
 results = pd.concat(frames, names=["method", "row"])
 

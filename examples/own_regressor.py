@@ -23,6 +23,7 @@ frames = {
         seeds=range(2),
         metrics=("q_error", "return"),
         progress=False,
+        evaluate_every=4,
     )
     for name, regressor in regressors.items()
 }

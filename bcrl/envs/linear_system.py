@@ -147,10 +147,9 @@ class LinearSystem:
 
 def _rows(*arrays: Floats) -> tuple[tuple[int, ...], list[Floats]]:
     """The arrays' common leading axes, and each array as rows (n, k) over them."""
-    leads = [array.shape[:-1] for array in arrays]
-    lead = leads[0]
-    if leads.count(lead) < len(leads):  # rare; it takes longer than a step
-        lead = np.broadcast_shapes(*leads)
+    lead, *others = (array.shape[:-1] for array in arrays)
+    if others.count(lead) < len(others):  # rare; it takes longer than a step
+        lead = np.broadcast_shapes(lead, *others)
         arrays = tuple(np.broadcast_to(a, (*lead, a.shape[-1])) for a in arrays)
     return lead, [writable(a).reshape(-1, a.shape[-1]) for a in arrays]
 

@@ -52,10 +52,7 @@ class DQN:
     def learn(
         self, stage: Stage, start: StageInit, batch: SeedBatch, state: Any = None
     ) -> Iterator[Pause]:
-        """Learn a stage; yields before the first step and after each.
-
-        Snapshots come before the first step that is not random, and then regularly.
-        """
+        """Learn a stage; yields a pause or Snapshot at first and after each step."""
         from bcrl.learning.dqn_trainer import DQNTrainer  # torch is slow
 
         run = DQNTrainer(self, stage, start, batch, state)

@@ -160,11 +160,9 @@ class DQNTrainer:
         if not isinstance(behavior, ResidualPolicy):
             return own, own
         advised = greedy(prior, u[..., 2])
-        copying = (
-            now.n_greedy_decisions < behavior.offset
-        )  # seeds; greedy lanes of them
-        copying = copying.reshape(-1, *[1] * (own.ndim - 1)) & (u[..., 0] >= epsilon)
-        own = np.where(copying, advised, own)
+        few = now.n_greedy_decisions < behavior.offset  # (S,)
+        few = few.reshape(-1, *[1] * (own.ndim - 1))
+        own = np.where(few & (u[..., 0] >= epsilon), advised, own)
         return own, self._combined[advised, own]
 
     def update(self) -> None:

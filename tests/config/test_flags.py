@@ -29,9 +29,6 @@ def everything(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
-# --- the help ---
-
-
 def test_the_help_names_every_group_option_and_flag_on_a_screen():
     text = flags.manual(None)
     assert len(text.splitlines()) <= 62
@@ -75,8 +72,6 @@ def test_help_and_tab_import_nothing_large(tmp_path):
         assert done.stdout and done.stderr == "[]\n"
 
 
-# --- Tab ---
-
 COMPLETED = """
 eval "$(bcrl -sc install=bash)"
 COMP_LINE="$1"; COMP_POINT=${#1}; words=($1); COMP_CWORD=$(( ${#words[@]} - 1 ))
@@ -112,18 +107,12 @@ def test_bash_proposes_them(tmp_path):
     command.parent.mkdir()
     command.write_text(f'#!/bin/sh\nexec {sys.executable} -c "{PROGRAM}" "$@"\n')
     command.chmod(0o755)
-    done = subprocess.run(
-        ["bash", "--norc", "-c", COMPLETED, "bash", "bcrl env=ca"],
-        env={**os.environ, "PATH": f"{command.parent}:{os.environ['PATH']}"},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-    )
+    words = ["bash", "--norc", "-c", COMPLETED, "bash", "bcrl env=ca"]
+    there = {"PATH": f"{command.parent}:{os.environ['PATH']}"}
+    there = {"cwd": tmp_path, "env": {**os.environ, **there}}
+    done = subprocess.run(words, **there, capture_output=True, text=True)
     assert done.stderr == "" and done.returncode == 0
     assert set(done.stdout.split()) == TAB["bcrl env=ca"]
-
-
-# --- the dry run and the overview ---
 
 
 def test_a_dry_run_lists_what_is_left_and_writes_nothing(tmp_path):
@@ -162,9 +151,8 @@ def test_the_command_shows_tables_and_writes_nothing(tmp_path, monkeypatch, caps
 def states(text: str) -> dict[str, list[int]]:
     """Row by row: seeds, complete, running, interrupted, failed, damaged, waiting."""
     head, *rows = text.splitlines()
-    ends = [
-        re.search(rf"\b{word}\b", head).end() for word in ("seeds", *records.STATES)
-    ]
+    words = ("seeds", *records.STATES)
+    ends = [re.search(rf"\b{word}\b", head).end() for word in words]
     found = {}
     for row in rows[: [x.startswith("in all") for x in rows].index(True)]:
         cells = [row[:end].rsplit("  ", 1)[-1].strip() for end in ends]
@@ -191,9 +179,6 @@ def test_the_overview_tells_states_apart_by_locks_and_files(tmp_path):
     assert states(overview.status(asked))["smoke maze FQI@t"] == [6, 2, 0, 2, 1, 0, 1]
 
 
-# --- debug and local ---
-
-
 def test_debug_is_small_strict_alone_and_apart(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     p = plan("env=maze", "variant=BC", "algorithm/regressor=tabular", "debug=on")
@@ -214,12 +199,9 @@ def test_a_local_file_sets_a_users_paths_and_the_command_line_wins(tmp_path):
     text = "{runs_dir: elsewhere, workers: 2, checkpoint_every: 5}"
     mine = own(tmp_path, text, "local/default")
     own(tmp_path, "workers: 4", "local/cluster")
-    for typed, root, workers in (
-        ("", "elsewhere", 2),
-        ("workers=3 experiment=fig5", "elsewhere", 3),
-        ("local=none", "runs", 1),
-        ("local=cluster", "runs", 4),
-    ):
+    ways = ("", "elsewhere", 2), ("workers=3 experiment=fig5", "elsewhere", 3)
+    ways += ("local=none", "runs", 1), ("local=cluster", "runs", 4)
+    for typed, root, workers in ways:
         (p,) = plans("env=maze", *typed.split(), config_dir=mine)
         assert (p.config["workers"], p.root) == (workers, Path(root))
         assert p.tag is None or "fig" in typed  # the same numbers

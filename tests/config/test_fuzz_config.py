@@ -145,7 +145,6 @@ SOME = given(st.lists(overrides(), min_size=1, max_size=3), st.sampled_from(BASE
 test_some_bad_overrides_end_in_a_message = fuzz(0.1, most=12)(SOME(driven))
 test_bad_overrides_end_in_a_message = pytest.mark.slow(fuzz(0.55)(SOME(driven)))
 
-
 WORDS = st.sampled_from([value for value in BAD if "\0" not in value])
 LEAVES = st.one_of(
     *(st.none(), st.integers(-(10**40), 10**40), st.floats(), st.booleans(), WORDS),

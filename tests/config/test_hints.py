@@ -131,9 +131,6 @@ def test_globs_choose_options():
         plans(MAZE, "boosting=glob(z*)", multirun=True)
 
 
-# --- the other commands ---
-
-
 @pytest.mark.parametrize(
     ("main", "typed", "right"),
     [

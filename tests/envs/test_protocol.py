@@ -142,3 +142,9 @@ def test_scripts_may_count_in_numpys_integers_and_in_generators():
     made = stages(iter(HERE), iter([learner]))
     found = run(made, np.arange(1), iter(["return", "solved"]), progress=False)
     assert found.equals(plain)
+    longer = stages([*HERE, OpenCorridor(2.0)], FQI(5, 2, Forest(trees=2)))
+    often, seldom = (run(longer, [0], evaluate_every=n) for n in (1, 2))
+    assert seldom.iteration.tolist() == [2, 4, 5, 6, 8, 10]
+    assert seldom.equals(
+        often[often.iteration.isin(seldom.iteration)].reset_index(drop=True)
+    )

@@ -28,7 +28,6 @@ SWEEP = ("experiment=fig2", *SMALL)
 PROGRAM = "import sys; from bcrl.cli import main; sys.argv[0] = 'bcrl'; main()"
 LIMIT = 120.0  # seconds in which anything waited for must happen
 
-
 REJECTS = {
     "sbatch": "echo >> calls; [ $(wc -l < calls) -le {taken} ] && "
     "{{ echo Submitted batch job 4711; exit; }}; echo QOSMaxSubmit >&2; exit 1",
@@ -37,7 +36,6 @@ REJECTS = {
 }
 THREE = "-m env=maze variant=BC scale=smoke seeds.count=3 hydra/launcher=slurm"
 THREE += " hydra.launcher.seeds_per_job=1 progress=none"
-
 
 #: How many of two arrays sbatch takes → the exit code, and parts of the message.
 REJECTED = {
