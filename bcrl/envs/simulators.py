@@ -5,7 +5,7 @@ import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -177,6 +177,8 @@ class Simulator:
 @dataclass(eq=False)
 class SimulatedLanes(Lanes):
     """The lanes of a simulated task, counted in C order."""
+
+    costly: ClassVar[bool] = True
 
     shape: tuple[int, ...] = (0,)  # the lanes' axes
     simulators: list[Simulator] = field(default_factory=list)
