@@ -51,18 +51,21 @@ def compiled_step(one: Callable) -> Callable[..., Step]:
     return step
 
 
+one: Any = None  # each copy of `_loop` has its own
+
+
 def _loop(state, action, noise, after, reward, absorbing, *constants):
     """Fill `after` (n, d), `reward` and `absorbing` (n,), one call of `one` per row."""
     for i in range(len(state)):
-        found = one(state[i], action[i], noise[i], *constants)  # noqa: F821
+        found = one(state[i], action[i], noise[i], *constants)
         after[i], reward[i], absorbing[i] = found
 
 
 def _loop_over(function: Callable, one: Any) -> Callable:
     """`_loop` with its own `one`, whose compiled code is kept beside `function`'s."""
-    place = function.__code__
-    where = {"co_filename": place.co_filename, "co_firstlineno": place.co_firstlineno}
-    loop = FunctionType(_loop.__code__.replace(**where), {"one": one}, _loop.__name__)
+    path, line = function.__code__.co_filename, function.__code__.co_firstlineno
+    code = _loop.__code__.replace(co_filename=path, co_firstlineno=line)
+    loop = FunctionType(code, {"one": one}, _loop.__name__)
     loop.__module__ = function.__module__
     loop.__qualname__ = f"{function.__qualname__}.loop"
     return loop

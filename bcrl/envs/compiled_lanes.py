@@ -16,7 +16,7 @@ from bcrl.common.serialization import storable
 from bcrl.envs.base import Bools, Floats, Ints, Lanes
 from bcrl.envs.checks import LARGEST
 from bcrl.envs.classic import Physics, Unknown, physics_of
-from bcrl.envs.simulators import Simulator
+from bcrl.envs.simulators import SEEDS
 
 #: Gymnasium's wrappers that are functions of an action, or of an observation number by
 #: number, so that one call transforms the observations of all lanes.
@@ -26,17 +26,20 @@ _OF_OBSERVATIONS = ("RescaleObservation",)
 
 @dataclass(eq=False)
 class Model:
-    """A simulator's resets and the compiled steps that continue from them."""
+    """Gymnasium's own resets and the compiled steps that continue from them."""
 
-    simulator: Simulator
+    env: Any  # an environment that resets
     physics: Physics
     constants: tuple
     rescaling: list[Any]  # wrappers of observations, the innermost first
 
-    def reset(self, number: float) -> tuple[Floats, Floats]:
-        """Hidden state (h,) and observation (d,) after a reset by `number`."""
-        seen = self.simulator.reset(number)
-        return np.array(self.simulator.env.unwrapped.state, np.float64), seen
+    def reset(self, numbers: Floats) -> tuple[Floats, Floats]:
+        """Hidden states (n, h) and observations (n, d) after resets by `numbers`."""
+        hidden, seen, inner = [], [], self.env.unwrapped
+        for seed in (numbers * SEEDS).astype(np.int64).tolist():
+            seen.append(self.env.reset(seed=seed)[0])
+            hidden.append(inner.state)
+        return np.array(hidden, np.float64), np.array(seen, np.float64)
 
     def step(self, hidden: Floats, action: Ints) -> tuple[Floats, Floats, Any, Any]:
         """Hidden states (..., h), observations (..., d), rewards and terminated."""
@@ -69,7 +72,7 @@ def model_of(recipe: Any, env: Any) -> Model | None:
         constants = physics.constants(env, actions)
     except (Unknown, ArithmeticError):
         return None
-    return Model(Simulator(recipe), physics, constants, rescaling)
+    return Model(recipe.make(), physics, constants, rescaling)
 
 
 class Alone:
@@ -80,13 +83,13 @@ class Alone:
 
     def reset(self, number: float) -> Floats:
         """The first observation (d,)."""
-        self.hidden, seen = self.model.reset(number)
-        return seen
+        self.hidden, seen = self.model.reset(np.array([number]))
+        return seen[0]
 
     def step(self, action: int) -> tuple[Floats, float, bool, bool]:
         """Observation (d,), reward, terminated, truncated."""
-        found = self.model.step(self.hidden, np.array(action))
-        self.hidden, seen, reward, ended = found
+        self.hidden, *found = self.model.step(self.hidden, np.array([action]))
+        seen, reward, ended = (each[0] for each in found)
         return seen, float(reward), bool(ended), False
 
     def close(self) -> None:
@@ -110,10 +113,10 @@ class CompiledLanes(Lanes):
 
     def begin(self, start: Floats) -> Floats:
         """First observations (..., d) after resets by numbers (..., 1) in [0, 1)."""
-        lead, self.failures = start.shape[:-1], {}
-        self.hidden = np.zeros((*lead, len(self.env.trial.model.reset(0.0)[0])))
-        state = np.zeros((*lead, self.env.state_dim))
-        return self.restart(np.ones(lead, bool), start, state)
+        self.failures, lead = {}, start.shape[:-1]
+        self.hidden, seen = self.env.trial.model.reset(start.reshape(-1))
+        self.hidden = self.hidden.reshape(*lead, -1)
+        return seen.reshape(*lead, -1)
 
     def step(self, state: Any, action: NDArray, noise: Any, lanes: Any = ...) -> tuple:
         """Observations, rewards, terminated and truncated of the chosen lanes."""
@@ -127,12 +130,11 @@ class CompiledLanes(Lanes):
 
     def restart(self, over: Bools, start: Floats, state: Floats) -> Floats:
         """All observations; lanes that are over are reset."""
-        state = state.copy()
-        places = zip(np.argwhere(over), np.flatnonzero(over).tolist(), strict=True)
-        for place, number in places:
-            if number not in self.failures:
-                found = self.env.trial.model.reset(float(start[*place, 0]))
-                self.hidden[*place], state[*place] = found
+        state, over = state.copy(), over.copy()
+        over.reshape(-1)[list(self.failures)] = False
+        if over.any():
+            found = self.env.trial.model.reset(start[over][:, 0])
+            self.hidden[over], state[over] = found
         return state
 
     @property

@@ -18,7 +18,7 @@ from bcrl.envs.base import Bools, Floats, Lanes
 from bcrl.envs.checks import LARGEST, described, shown
 from bcrl.errors import BcrlError
 
-_SEEDS = 2**31  # resets take seeds below: every 32-bit generator accepts them
+SEEDS = 2**31  # resets take seeds below: every 32-bit generator accepts them
 
 
 class BrokenSimulator(BcrlError):
@@ -74,7 +74,7 @@ class Simulator:
         return self._reset()
 
     def _reset(self) -> Floats:
-        answer = self._call("reset", self.env.reset, seed=int(self.number * _SEEDS))
+        answer = self._call("reset", self.env.reset, seed=int(self.number * SEEDS))
         seen, info = self._values("reset", answer, "observation, info")
         self.succeeded = self._success("reset", info)
         self.seen = self._vector("reset", seen)
