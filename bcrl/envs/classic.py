@@ -27,15 +27,15 @@ class Physics(NamedTuple):
     observation: Callable[[Floats], NDArray]  # (n, d) of hidden states (n, h)
 
 
-class Unknown(Exception):
+class UnknownPhysics(Exception):
     """An environment whose step is not known here."""
 
 
 def _numbers(env: Any, names: str) -> tuple[float, ...]:
-    """Attributes of an environment; Unknown for one that is no plain number."""
+    """Attributes of an environment; UnknownPhysics for one that is no plain number."""
     found = [getattr(env, name) for name in names.split()]
     if not all(type(value) in (int, float) for value in found):
-        raise Unknown
+        raise UnknownPhysics
     return tuple(map(float, found))
 
 
@@ -160,7 +160,7 @@ def _acrobot(state, action, noise, torques, dt, fastest, constants, nips):
 def _acrobot_constants(env: Any, actions: list) -> tuple:
     dt, noise, *fastest = _numbers(env, "dt torque_noise_max MAX_VEL_1 MAX_VEL_2")
     if noise > 0.0:
-        raise Unknown
+        raise UnknownPhysics
     names = "LINK_MASS_1 LINK_MASS_2 LINK_LENGTH_1 LINK_COM_POS_1 LINK_COM_POS_2"
     constants = *_numbers(env, f"{names} LINK_MOI"), _SQUARE
     torques = np.array([env.AVAIL_TORQUE[action] for action in actions], np.float64)
@@ -209,10 +209,10 @@ PHYSICS = {
 
 
 def physics_of(env: Any) -> Physics:
-    """The physics of an unwrapped environment; Unknown if there is none."""
+    """The physics of an unwrapped environment; UnknownPhysics if there is none."""
     cls = type(env)
     owner, _, module = cls.__module__.rpartition(".")
     name = f"{module}.{cls.__qualname__}"
     if owner != "gymnasium.envs.classic_control" or name not in PHYSICS:
-        raise Unknown
+        raise UnknownPhysics
     return PHYSICS[name]

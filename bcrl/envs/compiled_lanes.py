@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bcrl.common.serialization import storable
 from bcrl.envs.base import Bools, Floats, Ints, Lanes
 from bcrl.envs.checks import LARGEST
-from bcrl.envs.classic import Physics, Unknown, physics_of
+from bcrl.envs.classic import Physics, UnknownPhysics, physics_of
 from bcrl.envs.simulators import SEEDS
 
 #: Gymnasium's wrappers that are functions of an action, or of an observation number by
@@ -70,7 +70,7 @@ def model_of(recipe: Any, env: Any) -> Model | None:
             env = env.env
         physics = physics_of(env)
         constants = physics.constants(env, actions)
-    except (Unknown, ArithmeticError):
+    except (UnknownPhysics, ArithmeticError):
         return None
     return Model(recipe.make(), physics, constants, rescaling)
 
