@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.common.serialization import storable
+from bcrl.envs._recipe import Recipe
 from bcrl.envs.base import Bools, Floats, Ints, Lanes
 from bcrl.envs.checks import LARGEST
 from bcrl.envs.classic import Physics, UnknownPhysics, physics_of
@@ -51,9 +52,13 @@ class Model:
         return after, seen.reshape(*reward.shape, -1).astype(np.float64), reward, ended
 
 
-def model_of(recipe: Any, env: Any) -> Model | None:
-    """The model of a recipe that made `env`; None if its steps are not compiled."""
-    start = int(env.action_space.start)
+@functools.lru_cache(maxsize=256)
+def model_of(recipe: Recipe) -> Model | None:
+    """The model of a recipe's environment; None if its steps are not compiled."""
+    if recipe.observation is not None:
+        return None
+    env: Any = recipe.make()
+    whole, start = env, int(env.action_space.start)
     actions: list = [start + i for i in range(int(env.action_space.n))]
     rescaling: list[Any] = []
     try:
@@ -68,11 +73,12 @@ def model_of(recipe: Any, env: Any) -> Model | None:
             elif name != "OrderEnforcing":
                 return None
             env = env.env
-        physics = physics_of(env)
+        if (physics := physics_of(env)) is None:
+            return None
         constants = physics.constants(env, actions)
     except (UnknownPhysics, ArithmeticError):
         return None
-    return Model(recipe.make(), physics, constants, rescaling)
+    return Model(whole, physics, constants, rescaling)
 
 
 class Alone:
@@ -111,16 +117,20 @@ class CompiledLanes(Lanes):
 
     hidden: Floats = field(default_factory=lambda: np.empty((0, 0)))  # (..., h)
 
+    @functools.cached_property
+    def _model(self) -> Any:
+        return model_of(self.env.recipe)
+
     def begin(self, start: Floats) -> Floats:
         """First observations (..., d) after resets by numbers (..., 1) in [0, 1)."""
         self.failures, lead = {}, start.shape[:-1]
-        self.hidden, seen = self.env.trial.model.reset(start.reshape(-1))
+        self.hidden, seen = self._model.reset(start.reshape(-1))
         self.hidden = self.hidden.reshape(*lead, -1)
         return seen.reshape(*lead, -1)
 
     def step(self, state: Any, action: NDArray, noise: Any, lanes: Any = ...) -> tuple:
         """Observations, rewards, terminated and truncated of the chosen lanes."""
-        found = self.env.trial.model.step(self.hidden[lanes], action)
+        found = self._model.step(self.hidden[lanes], action)
         self.hidden[lanes], seen, reward, ended = found
         if self.failures or not np.abs(seen).max(initial=0.0) <= LARGEST:
             failed = self._failed(seen, lanes)
@@ -133,7 +143,7 @@ class CompiledLanes(Lanes):
         state, over = state.copy(), over.copy()
         over.reshape(-1)[list(self.failures)] = False
         if over.any():
-            found = self.env.trial.model.reset(start[over][:, 0])
+            found = self._model.reset(start[over][:, 0])
             self.hidden[over], state[over] = found
         return state
 

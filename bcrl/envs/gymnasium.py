@@ -16,7 +16,8 @@ from bcrl.common.checks import one_of
 from bcrl.envs._recipe import Recipe, spec_of
 from bcrl.envs.base import RULES, Floats, Ints, Lanes, check_episodes, default_success
 from bcrl.envs.checks import check_different, described, once, unresolved
-from bcrl.envs.compiled_lanes import Alone, CompiledLanes, Model, model_of, sines_differ
+from bcrl.envs.classic import physics_of
+from bcrl.envs.compiled_lanes import Alone, CompiledLanes, model_of, sines_differ
 from bcrl.envs.simulators import SimulatedLanes, Simulator, vectors
 from bcrl.errors import BcrlError, ConfigError, at_least
 
@@ -34,7 +35,7 @@ class Trial(NamedTuple):
     fresh: bool  # whether episodes repeat themselves in new simulators only
     notes: list[str]  # about answers that were converted, and components too fine
     success: str  # the rule that `auto` chooses
-    model: Model | None  # the steps in compiled code; None if they are unknown
+    compiled: bool  # whether compiled steps gave the same episodes
 
 
 @dataclass(frozen=True)
@@ -83,8 +84,7 @@ class Gymnasium(Recipe):
             why = f"is needed: {self.id} is registered without a number of steps"
             raise ConfigError("env.horizon", None, why)
         check_episodes(self.gamma, horizon)
-        recipe = Recipe(*(getattr(self, field.name) for field in fields(Recipe)))
-        seen = trial(recipe, horizon, self.verify)
+        seen = trial(self.recipe, horizon, self.verify)
         rule, threshold = self._success(spec.reward_threshold, seen.success)
         own = self.action_vectors
         sizes = [len(vector) for vector in own or ()]
@@ -113,6 +113,11 @@ class Gymnasium(Recipe):
             raise ConfigError("env.success_threshold", threshold, why)
         return rule, threshold
 
+    @property
+    def recipe(self) -> Recipe:
+        """What makes the task's simulators."""
+        return Recipe(*(getattr(self, field.name) for field in fields(Recipe)))
+
     def initial(self, noise: Floats) -> Floats:
         """The numbers that reset lanes: the noise (..., 1) itself."""
         return noise
@@ -122,8 +127,8 @@ class Gymnasium(Recipe):
         return Simulator(self, self.state_dim, self.trial.fresh, render_mode)
 
     def lanes(self) -> Lanes:
-        """Compiled lanes if the trial found a model, else simulators side by side."""
-        return CompiledLanes(self) if self.trial.model else SimulatedLanes(self)
+        """Compiled lanes if the trial allows them, else simulators side by side."""
+        return CompiledLanes(self) if self.trial.compiled else SimulatedLanes(self)
 
     def evaluation_states(self) -> Floats:
         """Observations after `starts` resets, always the same ones, (starts, d)."""
@@ -178,7 +183,7 @@ def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
             trace.append(tuple(outcome and outcome[0] for outcome in outcomes))
             if time.monotonic() > deadline:
                 break
-        model = model_of(recipe, first.env)
+        classic = physics_of(first.env.unwrapped) is not None
     finally:
         for simulator in simulators:
             simulator.close()
@@ -195,6 +200,7 @@ def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
         raise ConfigError("env.id", recipe.id, why)
     if unsteady:
         notes.append("a reset leaves something behind, so each episode has a new one")
+    model = model_of(recipe) if classic else None
     if model and (differs := _unsteady(Alone(model), actions, trace)):
         notes.append(f"steps are not compiled, since {differs} would differ")
         model = None
@@ -207,8 +213,8 @@ def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
     reports = any(simulator.reports for simulator in simulators)
     low, high = min(rewards, default=0.0), max(rewards, default=0.0)
     rule = default_success(reports, low, high, spec_of(recipe.id).reward_threshold)
-    fresh = bool(unsteady)
-    return Trial(n_actions, first.state_dim, trace, fresh, notes, rule, model)
+    found = n_actions, first.state_dim, trace, bool(unsteady), notes, rule
+    return Trial(*found, model is not None)
 
 
 def _episode(

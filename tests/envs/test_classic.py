@@ -1,5 +1,7 @@
 """Classic control in compiled code, against Gymnasium's own simulators."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -34,7 +36,8 @@ CASES = [
 @exact
 @pytest.mark.parametrize(("name", "changes"), CASES)
 def test_every_bit_is_that_of_gymnasium(name, changes):
-    task, rng = Gymnasium(name, **changes), np.random.default_rng(0)
+    sent = pickle.dumps(Gymnasium(name, **changes))  # as to a worker process
+    task, rng = pickle.loads(sent), np.random.default_rng(0)
     lanes, own = task.lanes(), SimulatedLanes(task)
     assert isinstance(lanes, CompiledLanes)
     start = rng.random((2, 8, 1))
