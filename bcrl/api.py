@@ -18,6 +18,7 @@ from bcrl.config.rules import course
 from bcrl.config.variant import Composition, order_of
 from bcrl.envs import Env, check_tasks, is_simulated
 from bcrl.envs.car_on_hill import CarOnHill
+from bcrl.envs.compiled import compiled_step
 from bcrl.envs.gymnasium import Gymnasium
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.envs.maze import Maze
@@ -35,7 +36,8 @@ from bcrl.q.regressors.scikit import Sklearn
 from bcrl.results.tables import read_folder as read
 from bcrl.run.workers import cores
 
-__all__ = ["CarOnHill", "Gymnasium", "LinearSystem", "Maze", "read", "run", "stages"]
+__all__ = ["CarOnHill", "Gymnasium", "LinearSystem", "Maze", "compiled_step"]
+__all__ += ["read", "run", "stages"]
 __all__ += ["DQN", "FQI", "LSPI", "Forest", "Sklearn", "Tabular"]
 __all__ += ["Boost", "PolicyReuse", "ResidualPolicy", "Shape", "warm_start"]
 

@@ -98,6 +98,8 @@ class FiniteEnv(Env, Protocol):
 class Lanes:
     """Episodes of a pure environment side by side, one per lane; any leading axes."""
 
+    costly: ClassVar[bool] = False  # whether only few lanes should exist at a time
+
     env: Any
     #: Why a lane's simulator failed, by the lane's number in C order. Such a lane gives
     #: zeros and is cut at every step.
@@ -126,7 +128,7 @@ class SimulatedEnv(Env, Protocol):
     starts: int  # random resets from which FQI's greedy policy is evaluated
 
     def lanes(self) -> Lanes:
-        """Simulators side by side."""
+        """Episodes side by side."""
 
     def check_tasks(self, tasks: Sequence[Env]) -> None:
         """Raise ConfigError for tasks that are alike or not reproducible."""

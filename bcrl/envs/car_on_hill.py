@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bcrl.common.compiling import kept
-from bcrl.envs.base import Bools, Floats, Ints, Step, check_episodes
+from bcrl.envs.base import Floats, Ints, Step, check_episodes
+from bcrl.envs.compiled import compiled_step
 from bcrl.errors import ConfigError
 
 FORCE = 4.0  # N, to the left (action 0) or to the right (action 1)
@@ -71,12 +72,7 @@ class CarOnHill:
 
     def step(self, state: Floats, action: Ints, noise: Floats | None = None) -> Step:
         """Hold a force for 0.1 s; IndexError for an action other than 0 and 1."""
-        state, action = np.asarray(state, np.float64), np.asarray(action, np.int64)
-        shape = np.broadcast_shapes(state.shape[:-1], action.shape)
-        after = np.array(np.broadcast_to(state, (*shape, 2)), order="C")
-        action = np.array(np.broadcast_to(action, shape), order="C")
-        reward, absorbing = _step(after.reshape(-1, 2), action.reshape(-1), self.mass)
-        return after, reward.reshape(shape), absorbing.reshape(shape)
+        return _step(state, action, None, self.mass)
 
     def evaluation_states(self) -> Floats:
         """A 10 × 10 grid over the bounds, position-major, shape (100, 2)."""
@@ -196,20 +192,17 @@ def _outcome(p: float, v: float) -> float:
     return 1.0 if p > MAX_POSITION else 0.0
 
 
-@kept(nogil=True, error_model="numpy")
-def _step(state: Floats, action: Ints, mass: float) -> tuple[Floats, Bools]:
-    """Replace states (n, 2) by the next ones; give rewards and whether absorbing."""
-    reward, absorbing = np.zeros(len(state)), np.ones(len(state), np.bool_)
-    for i in range(len(state)):
-        p, v = state[i]
-        if action[i] != 0 and action[i] != 1:
-            raise IndexError("car_on_hill has the actions 0 (left) and 1 (right)")
-        if _outcome(p, v) == 0.0:
-            p, v = _advance(p, v, (FORCE if action[i] == 1 else -FORCE) / mass)
-            state[i, 0], state[i, 1] = p, v
-            reward[i] = _outcome(p, v)
-            absorbing[i] = reward[i] != 0.0
-    return reward, absorbing
+@compiled_step
+def _step(state, action, noise, mass):
+    """The next state, the reward and whether it is absorbing."""
+    p, v = state
+    if action != 0 and action != 1:
+        raise IndexError("car_on_hill has the actions 0 (left) and 1 (right)")
+    if _outcome(p, v) != 0.0:
+        return (p, v), 0.0, True
+    p, v = _advance(p, v, (FORCE if action == 1 else -FORCE) / mass)
+    reward = _outcome(p, v)
+    return (p, v), reward, reward != 0.0
 
 
 ENV = CarOnHill

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from bcrl.common.checks import one_of
 from bcrl.envs._recipe import Recipe, spec_of
-from bcrl.envs.base import RULES, Floats, Ints, check_episodes, default_success
+from bcrl.envs.base import RULES, Floats, Ints, Lanes, check_episodes, default_success
 from bcrl.envs.checks import check_different, described, once, unresolved
+from bcrl.envs.classic import physics_of
+from bcrl.envs.compiled_lanes import Alone, CompiledLanes, model_of, sines_differ
 from bcrl.envs.simulators import SimulatedLanes, Simulator, vectors
 from bcrl.errors import BcrlError, ConfigError, at_least
 
@@ -33,6 +35,7 @@ class Trial(NamedTuple):
     fresh: bool  # whether episodes repeat themselves in new simulators only
     notes: list[str]  # about answers that were converted, and components too fine
     success: str  # the rule that `auto` chooses
+    compiled: bool  # whether compiled steps gave the same episodes
 
 
 @dataclass(frozen=True)
@@ -81,8 +84,7 @@ class Gymnasium(Recipe):
             why = f"is needed: {self.id} is registered without a number of steps"
             raise ConfigError("env.horizon", None, why)
         check_episodes(self.gamma, horizon)
-        recipe = Recipe(*(getattr(self, field.name) for field in fields(Recipe)))
-        seen = trial(recipe, horizon, self.verify)
+        seen = trial(self.recipe, horizon, self.verify)
         rule, threshold = self._success(spec.reward_threshold, seen.success)
         own = self.action_vectors
         sizes = [len(vector) for vector in own or ()]
@@ -111,6 +113,11 @@ class Gymnasium(Recipe):
             raise ConfigError("env.success_threshold", threshold, why)
         return rule, threshold
 
+    @property
+    def recipe(self) -> Recipe:
+        """What makes the task's simulators."""
+        return Recipe(*(getattr(self, field.name) for field in fields(Recipe)))
+
     def initial(self, noise: Floats) -> Floats:
         """The numbers that reset lanes: the noise (..., 1) itself."""
         return noise
@@ -119,9 +126,9 @@ class Gymnasium(Recipe):
         """A new simulator of this task."""
         return Simulator(self, self.state_dim, self.trial.fresh, render_mode)
 
-    def lanes(self) -> SimulatedLanes:
-        """Simulators side by side."""
-        return SimulatedLanes(self)
+    def lanes(self) -> Lanes:
+        """Compiled lanes if the trial allows them, else simulators side by side."""
+        return CompiledLanes(self) if self.trial.compiled else SimulatedLanes(self)
 
     def evaluation_states(self) -> Floats:
         """Observations after `starts` resets, always the same ones, (starts, d)."""
@@ -176,6 +183,7 @@ def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
             trace.append(tuple(outcome and outcome[0] for outcome in outcomes))
             if time.monotonic() > deadline:
                 break
+        classic = physics_of(first.env.unwrapped) is not None
     finally:
         for simulator in simulators:
             simulator.close()
@@ -184,24 +192,34 @@ def trial(recipe: Recipe, horizon: int, verify: bool) -> Trial:
         space = " ".join(str(first.space).split())[:90]
         note = f"observations, {space}, are flattened to "
         notes.append(f"{note}{first.state_dim} numbers, as by FlattenObservation")
-    unsteady = _unsteady(recipe, actions, trace, False) if verify else ""
-    if unsteady and _unsteady(recipe, actions, trace, True):
+    unsteady = _unsteady(Simulator(recipe), actions, trace) if verify else ""
+    if unsteady and _unsteady(Simulator(recipe, fresh=True), actions, trace):
         why = f"{unsteady} differs after the same reset and actions; expected the same "
         why += "each time: randomness from reset(seed=…) only, no state that outlives "
         why += "a reset or that simulators share"
         raise ConfigError("env.id", recipe.id, why)
     if unsteady:
         notes.append("a reset leaves something behind, so each episode has a new one")
+    model = model_of(recipe) if classic else None
+    if model and (differs := _unsteady(Alone(model), actions, trace)):
+        notes.append(f"steps are not compiled, since {differs} would differ")
+        model = None
+    if model and sines_differ():
+        note = "NumPy's sines differ from the C library's on this processor, so a step "
+        notes.append(f"{note}may differ from Gymnasium's in the last bits")
     if coarse := unresolved(np.array(seen)):
         wrapper = "env.wrappers=[{name: RescaleObservation, min_obs: -1, max_obs: 1}]"
         notes.append(f"{coarse}; rescale: {wrapper} or env.observation=module.function")
     reports = any(simulator.reports for simulator in simulators)
     low, high = min(rewards, default=0.0), max(rewards, default=0.0)
     rule = default_success(reports, low, high, spec_of(recipe.id).reward_threshold)
-    return Trial(n_actions, first.state_dim, trace, bool(unsteady), notes, rule)
+    found = n_actions, first.state_dim, trace, bool(unsteady), notes, rule
+    return Trial(*found, model is not None)
 
 
-def _episode(simulator: Simulator, number: int, actions: list[int]) -> Iterator[tuple]:
+def _episode(
+    simulator: Simulator | Alone, number: int, actions: list[int]
+) -> Iterator[tuple]:
     """A digest, observation, reward and end after the reset and each step."""
     outcome = simulator.reset((number + 0.5) / _TRIES), 0.0, False, False
     for action in [*actions, None]:
@@ -211,9 +229,9 @@ def _episode(simulator: Simulator, number: int, actions: list[int]) -> Iterator[
         outcome = simulator.step(action)
 
 
-def _unsteady(recipe: Recipe, actions: NDArray, trace: list, fresh: bool) -> str:
-    """The first step that differs when one simulator, or `fresh` ones, play again."""
-    with closing(Simulator(recipe, fresh=fresh)) as simulator:
+def _unsteady(simulator: Simulator | Alone, actions: NDArray, trace: list) -> str:
+    """The first step that differs when a simulator plays the episodes in turn."""
+    with closing(simulator):
         for number, own in enumerate(actions.tolist()):
             played = _episode(simulator, number, own)
             for t, (outcome, expected) in enumerate(zip(played, trace, strict=False)):

@@ -5,7 +5,7 @@ import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -18,7 +18,7 @@ from bcrl.envs.base import Bools, Floats, Lanes
 from bcrl.envs.checks import LARGEST, described, shown
 from bcrl.errors import BcrlError
 
-_SEEDS = 2**31  # resets take seeds below: every 32-bit generator accepts them
+SEEDS = 2**31  # resets take seeds below: every 32-bit generator accepts them
 
 
 class BrokenSimulator(BcrlError):
@@ -74,7 +74,7 @@ class Simulator:
         return self._reset()
 
     def _reset(self) -> Floats:
-        answer = self._call("reset", self.env.reset, seed=int(self.number * _SEEDS))
+        answer = self._call("reset", self.env.reset, seed=int(self.number * SEEDS))
         seen, info = self._values("reset", answer, "observation, info")
         self.succeeded = self._success("reset", info)
         self.seen = self._vector("reset", seen)
@@ -177,6 +177,8 @@ class Simulator:
 @dataclass(eq=False)
 class SimulatedLanes(Lanes):
     """The lanes of a simulated task, counted in C order."""
+
+    costly: ClassVar[bool] = True
 
     shape: tuple[int, ...] = (0,)  # the lanes' axes
     simulators: list[Simulator] = field(default_factory=list)

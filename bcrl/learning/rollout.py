@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bcrl.envs import Env, Success, is_finite, is_simulated, lanes_of
+from bcrl.envs import Env, Success, is_finite, lanes_of
 from bcrl.envs.base import FiniteEnv
 from bcrl.learning import Booleans, Floats, Integers
 from bcrl.learning.policies import greedy, walk
@@ -113,11 +113,11 @@ def play(env: Env, policy: Policy, start: Floats, u: Floats) -> Episodes:
     length, reported = np.zeros(shape[1:], np.intp), None
     failed: dict[int, str] = {}
     # Few simulators run at the same time; the policy always sees the states of all.
-    seeds, each = AT_ONCE if is_simulated(env) else (n_seeds, n_episodes)
+    lanes = lanes_of(env)
+    seeds, each = AT_ONCE if lanes.costly else (n_seeds, n_episodes)
     parts = itertools.product(range(0, n_seeds, seeds), range(0, n_episodes, each))
     for s, e in parts:
         part = (slice(s, s + seeds), slice(e, e + each))
-        lanes = lanes_of(env)
         state[0][part] = lanes.begin(start[part])
         alive = np.zeros(shape[1:], bool)
         alive[part] = True

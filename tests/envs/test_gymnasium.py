@@ -12,6 +12,8 @@ from bcrl.common import serialization
 from bcrl.common.seeding import stream
 from bcrl.envs.base import default_success
 from bcrl.envs.checks import unresolved
+from bcrl.envs.compiled_lanes import CompiledLanes
+from bcrl.envs.simulators import SimulatedLanes
 from bcrl.errors import ConfigError
 from bcrl.evaluation.step_metrics import evaluate
 from bcrl.learning.rollout import play, starts_and_draws, success_of
@@ -87,9 +89,10 @@ def test_a_seed_is_the_same_alone_and_in_a_batch(learner):
     assert len(set(together.groupby("seed")["return"].sum())) > 1
 
 
-def test_lanes_from_a_checkpoint_continue_in_the_middle_of_an_episode(tmp_path):
+@pytest.mark.parametrize("kind", [SimulatedLanes, CompiledLanes])
+def test_lanes_from_a_checkpoint_continue_in_the_middle_of_an_episode(kind, tmp_path):
     task = Gymnasium("CartPole-v1", horizon=30)
-    lanes, rng = task.lanes(), np.random.default_rng(0)
+    lanes, rng = kind(task), np.random.default_rng(0)
     state = lanes.begin(rng.random((4, 1)))
     for _ in range(20):
         state, _, over, _ = lanes.step(state, rng.integers(2, size=4), None)
@@ -104,7 +107,7 @@ def test_lanes_from_a_checkpoint_continue_in_the_middle_of_an_episode(tmp_path):
 
 
 def test_a_replay_that_ends_elsewhere_fails_its_lane():
-    lanes = Gymnasium("CartPole-v1", horizon=30).lanes()
+    lanes = SimulatedLanes(Gymnasium("CartPole-v1", horizon=30))
     state = lanes.begin(np.full((3, 1), 0.25))
     lanes.step(state, np.ones(3, int), None)
     lanes.close()

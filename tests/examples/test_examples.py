@@ -30,7 +30,7 @@ def shown(name: str, tmp_path: Path) -> pd.DataFrame:
 
 def test_all_examples_are_tested():
     names = {path.stem for path in EXAMPLES.glob("*.py")}
-    own = {"own_env", "own_curriculum", "own_regressor"}
+    own = {"own_env", "own_compiled_env", "own_curriculum", "own_regressor"}
     assert names == own | {"minimal_bc_fqi", "minimal_sbc_dqn"}
 
 
@@ -58,6 +58,11 @@ def test_boosting_through_the_curriculum_beats_learning_from_scratch(name, tmp_p
     assert solved["FQI"] == 0.0
     assert solved["BC-FQI"] >= 0.6
     assert solved["BC-FQI"] >= solved["C-FQI"]
+
+
+@pytest.mark.slow
+def test_a_compiled_environment_is_learned(tmp_path):
+    assert float(shown("own_compiled_env", tmp_path).loc["3", 2]) >= 0.6
 
 
 @pytest.mark.slow
