@@ -179,7 +179,7 @@ def documents(draw):
 
 
 @pytest.mark.slow
-@fuzz(0.3)
+@fuzz(0.2)
 @given(documents(), st.sampled_from(["experiment", "env", "algorithm", "primary"]))
 def test_bad_configs_of_ones_own_end_in_a_message(text, place):
     if place == "primary":

@@ -28,7 +28,7 @@ from tests.conftest import plan
 from tests.run.runs import KINDS, MAZE, TABULAR, about, at_row, compared, run
 
 KILLS = int(os.environ.get("BCRL_KILLS", "0"))
-FEW = ("maze C", "car_on_hill BC", "dqn C", "dqn SBC")
+FEW = ("maze C", "car_on_hill C", "dqn C", "dqn SBC")
 ROOT = Path(__file__).parents[2]
 
 

@@ -27,9 +27,9 @@ FAST = ("maze BC", "car_on_hill C", "dqn SBC")
 )
 def test_a_seed_is_the_same_alone_and_among_others(tmp_path, kind):
     alone = run(tmp_path / "a", *KINDS[kind], "seeds=[3]", "threads=1")
-    among = run(tmp_path / "b", *KINDS[kind], "seeds=5", "threads=2")
+    among = run(tmp_path / "b", *KINDS[kind], "seeds=4", "threads=2")
     assert results(alone, 3) == results(among, 3)
-    assert len({results(among, seed)[1] for seed in range(5)}) == 5  # seeds differ
+    assert len({results(among, seed)[1] for seed in range(4)}) == 4  # seeds differ
 
 
 @pytest.mark.slow
