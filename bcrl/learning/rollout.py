@@ -114,7 +114,8 @@ def play(env: Env, policy: Policy, start: Floats, u: Floats) -> Episodes:
     failed: dict[int, str] = {}
     # Few simulators run at the same time; the policy always sees the states of all.
     lanes = lanes_of(env)
-    seeds, each = AT_ONCE if lanes.costly else (n_seeds, n_episodes)
+    costly = getattr(lanes, "costly", True)  # a user's lanes may not say
+    seeds, each = AT_ONCE if costly else (n_seeds, n_episodes)
     parts = itertools.product(range(0, n_seeds, seeds), range(0, n_episodes, each))
     for s, e in parts:
         part = (slice(s, s + seeds), slice(e, e + each))
