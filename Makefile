@@ -55,7 +55,7 @@ test: $(READY) ## the fast tests (about 4 minutes on two cores)
 # Slow tests stay out of the coverage, which would double their time.
 test-all: $(READY) ## all tests, with the fast ones' coverage of the package
 	$(FAST_TESTS) --cov=bcrl --cov-report=term --cov-fail-under=90
-	$(PYTEST) --numprocesses 3 -m "slow or slurm or browser"  # some of them wait
+	$(PYTEST) --numprocesses 4 -m "slow or slurm or browser"  # some of them wait
 
 lint: $(READY) ## style, spelling, layers of imports, types
 	$(BIN)/ruff check .
