@@ -15,6 +15,8 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
+import torch
+
 from bcrl.config.plan import Plan
 from bcrl.run import runner
 from tests.conftest import plan
@@ -31,9 +33,6 @@ def forked(work: Callable[[], object]) -> int:
     if child:
         return child
     try:
-        import torch
-
-        torch.set_num_threads(1)
         work()
         os._exit(0)
     except BaseException as error:
@@ -75,7 +74,9 @@ def torment(words: tuple[str, ...], folder: Path, rng: random.Random, kills: int
         rounds += 1
         p = plan(*words, f"runs_dir={folder / str(rounds)}", "checkpoint_every=0.1")
         while True:
-            if within := rng.random() < 0.3:  # in the middle of a write
+            if done == kills:
+                child = forked(partial(runner.run, p))
+            elif within := rng.random() < 0.3:  # in the middle of a write
                 child = forked(partial(run_until_write, p, rng.randint(1, writes)))
             else:
                 child = forked(partial(runner.run, p))
@@ -118,6 +119,7 @@ def race(folder: Path, rng: random.Random, processes: int) -> dict:
 
 
 if __name__ == "__main__":
+    torch.set_num_threads(1)
     place, seed, kills, name = sys.argv[1:]
     rng = random.Random(f"{seed} {name}")
     if name.startswith("race of"):
