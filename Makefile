@@ -5,7 +5,6 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 SCALE ?= quick
 PYTEST := $(BIN)/python -m pytest
-FAST_TESTS := $(PYTEST) --numprocesses 2 -m "not slow and not slurm and not browser"
 WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 
 # Without bytecode each process would compile all of torch again.
@@ -50,12 +49,11 @@ verify: $(READY) ## check that every result in runs/ is complete, unchanged and 
 	$(BIN)/bcrl-verify
 
 test: $(READY) ## the fast tests (about 4 minutes on two cores)
-	$(FAST_TESTS)
+	$(PYTEST) --numprocesses 2 -m "not slow and not slurm and not browser"
 
-# Slow tests stay out of the coverage, which would double their time.
 test-all: $(READY) ## all tests, with the fast ones' coverage of the package
-	$(FAST_TESTS) --cov=bcrl --cov-report=term --cov-fail-under=90
-	$(PYTEST) --numprocesses 4 -m "slow or slurm or browser"  # some of them wait
+	$(PYTEST) --numprocesses 3 --dist worksteal \
+	  --cov=bcrl --cov-report=term --cov-fail-under=90
 
 lint: $(READY) ## style, spelling, layers of imports, types
 	$(BIN)/ruff check .

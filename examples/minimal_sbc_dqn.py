@@ -114,7 +114,7 @@ if __name__ == "__main__":
         m = lspi(rng) if name == "SBC-DQN" else np.zeros((6, 6))
         hidden = nn.Linear(4, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU()
         network = nn.Sequential(*hidden, nn.Linear(128, 8))
-        for now, _ in enumerate(sbc_dqn(network, m, rng, 8_000, target_update), 1):
+        for now, _ in enumerate(sbc_dqn(network, m, rng, 6_000, target_update), 1):
             if now % 2000 == 0:
                 score = evaluate(network, m, np.random.default_rng(1))
                 print(f"{name:8} {now:6}  {score:6.1f}")

@@ -4,8 +4,9 @@ import os
 import subprocess
 import sys
 from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -14,20 +15,25 @@ from bcrl.config import hydra_compose, jobs
 from bcrl.config.plan import Plan
 
 
-@pytest.fixture(autouse=True, scope="session")
-def _untraced() -> None:
-    """Coverage skips the million calls of Hydra, whose time it would double."""
-    traced = hydra_compose.compose
+@contextmanager
+def _untraced() -> Iterator[None]:
+    """Coverage is blind meanwhile: it would double the time of what has many calls."""
+    before = sys.gettrace()
+    sys.settrace(None)
+    try:
+        yield
+    finally:
+        sys.settrace(before)
 
-    def compose(*given: Any, **named: Any) -> Any:
-        before = sys.gettrace()
-        sys.settrace(None)
-        try:
-            return traced(*given, **named)
-        finally:
-            sys.settrace(before)
 
-    hydra_compose.compose = compose
+hydra_compose.compose = _untraced()(hydra_compose.compose)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Slow tests stay out of the coverage."""
+    with _untraced() if item.get_closest_marker("slow") else nullcontext():
+        return (yield)
 
 
 @pytest.fixture(autouse=True)
@@ -37,8 +43,9 @@ def _trusts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests on Slurm come first: others run while they wait."""
-    items.sort(key=lambda item: item.get_closest_marker("slurm") is None)
+    """Tests on Slurm come first, as others run while they wait; then the slow ones."""
+    for mark in ("slow", "slurm"):
+        items.sort(key=lambda item: item.get_closest_marker(mark) is None)
 
 
 def arguments(*overrides: str, multirun=False, config_dir=None) -> Namespace:
