@@ -51,6 +51,9 @@ verify: $(READY) ## check that every result in runs/ is complete, unchanged and 
 test: $(READY) ## the fast tests (about 4 minutes on two cores)
 	$(PYTEST) --numprocesses 2 -m "not slow and not slurm and not browser"
 
+# Tests share the cores among processes, not threads.
+test test-all: export OMP_NUM_THREADS = 1
+
 test-all: $(READY) ## all tests, with the fast ones' coverage of the package
 	$(PYTEST) --numprocesses 3 --dist worksteal \
 	  --cov=bcrl --cov-report=term --cov-fail-under=90

@@ -14,6 +14,8 @@ from bcrl.common import plugins
 from bcrl.config import hydra_compose, jobs
 from bcrl.config.plan import Plan
 
+LONG = ("slow", "slurm", "browser", "no_cover")
+
 
 @contextmanager
 def _untraced() -> Iterator[None]:
@@ -31,8 +33,8 @@ hydra_compose.compose = _untraced()(hydra_compose.compose)
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Slow tests stay out of the coverage."""
-    with _untraced() if item.get_closest_marker("slow") else nullcontext():
+    """The tests that take long stay out of the coverage."""
+    with _untraced() if any(map(item.get_closest_marker, LONG)) else nullcontext():
         return (yield)
 
 
