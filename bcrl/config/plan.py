@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bcrl.common import compiling, plugins
+from bcrl.common import plugins
 from bcrl.common.checks import construct, one_of
 from bcrl.common.identity import Plain
 from bcrl.config.algorithms import algorithm
@@ -68,7 +68,6 @@ class Plan:
 
 def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
     """The checked plan of a resolved config; `env` and `tag` name its directory."""
-    compiling.check()
     _check_outputs(config, tag)
     check_name("env", env)
     tasks, metrics = _tasks(config["env"])

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import hydra
 import yaml
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.config_search_path import ConfigSearchPath
@@ -32,7 +33,9 @@ ALLOWED = re.compile(
     r"mode|sweeper\.params\b.*|launcher\b.*|searchpath|(runtime|overrides)\b.*"
     r"|job\.(override_dirname|config_name)"
 )
-_OURS: dict[str, ConfigResult] = {}
+#: The providers of configs that don't change: ours and Hydra's own.
+_KNOWN = ("main", "hydra")
+_READ: dict[tuple[str, str], ConfigResult] = {}
 
 
 class ConfigFolder(FileConfigSource):
@@ -48,10 +51,10 @@ class ConfigFolder(FileConfigSource):
         name = os.path.normpath(self._normalize_file_name(config_path))
         if os.path.isabs(name) or name.startswith(".."):
             raise BcrlError(f"{config_path}: leads out of the folder {self.path}")
-        if self.provider == "main":  # ours, which every job of a sweep reads
-            if name not in _OURS:
-                _OURS[name] = super().load_config(config_path)
-            return copy.deepcopy(_OURS[name])
+        if self.provider in _KNOWN:  # every job of a sweep reads these
+            if (key := (self.provider, name)) not in _READ:
+                _READ[key] = super().load_config(config_path)
+            return copy.deepcopy(_READ[key])
         check_file(Path(self.path, name))
         loaded = super().load_config(config_path)
         package = loaded.header.get("package") or os.path.dirname(name)
@@ -63,13 +66,19 @@ class ConfigFolder(FileConfigSource):
 
 
 class OwnSearchPath(SearchPathPlugin):
-    """Has our own configs read as a `ConfigFolder`, too: they lead nowhere else."""
+    """Has our own configs read as a `ConfigFolder`, too: they lead nowhere else.
+
+    Hydra's own are read so, too, because they are cached then.
+    """
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Change the place of the main configs."""
+        """Change the places of both."""
         for place in search_path.get_path():
-            if place.provider == "main":
-                place.path = "bcrl://" + (place.path or "").removeprefix("file://")
+            folder = (place.path or "").removeprefix("file://")
+            if folder == "pkg://hydra.conf":
+                folder = str(Path(hydra.__file__).with_name("conf"))
+            if place.provider in _KNOWN:
+                place.path = f"{ConfigFolder.scheme()}://{folder}"
 
 
 def check_override(text: str) -> None:

@@ -7,7 +7,6 @@ from types import FunctionType
 from typing import Any
 
 import numpy as np
-from numba.core.errors import NumbaError
 
 from bcrl.common.arrays import writable
 from bcrl.common.compiling import kept
@@ -43,7 +42,11 @@ def compiled_step(one: Callable) -> Callable[..., Step]:
         random = writable(noise).reshape(n, noise.shape[-1])
         try:
             loop(*given, random, after, reward, absorbing, *constants)
-        except NumbaError as error:
+        except Exception as error:
+            from numba.core.errors import NumbaError  # a large import
+
+            if not isinstance(error, NumbaError):
+                raise
             why = f"numba cannot compile {one.__qualname__}: {_reason(error)}"
             raise TypeError(why) from error
         return after.reshape(*lead, d), reward.reshape(lead), absorbing.reshape(lead)
@@ -71,7 +74,7 @@ def _loop_over(function: Callable, one: Any) -> Callable:
     return loop
 
 
-def _reason(error: NumbaError) -> str:
+def _reason(error: Exception) -> str:
     """The first two lines that say something in numba's long message, and the place."""
     lines = re.sub(r"\x1b\[\d*m", "", str(error)).splitlines()
     said = [line.strip() for line in lines if line.strip()]

@@ -1,16 +1,15 @@
 """Policies as pure functions of action values and uniform draws."""
 
-import numba
 import numpy as np
 
 from bcrl.common.arrays import writable
-from bcrl.common.compiling import kept
+from bcrl.common.compiling import compiled, kept
 from bcrl.learning import Floats, Integers
 
 TIE = 1e-9  # distances between actions that differ by less are equal
 
 
-@numba.njit
+@compiled()
 def _choice(q, explore, u, epsilon):
     """⌊u A⌋ if `explore` is below ε, else the greatest of q (A,); 0 if NaN hides it."""
     if explore < epsilon:

@@ -4,6 +4,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 
+from bcrl.common import compiling
 from bcrl.common.signals import Interrupted, Stop
 from bcrl.common.terminal import say
 from bcrl.config.plan import Plan
@@ -31,6 +32,7 @@ def run(*plans: Plan) -> None:
     waits for seeds that another process computes. Raises SeedsFailed at the end if
     seeds failed, Interrupted after a signal, both with everything else kept.
     """
+    compiling.check()
     quiet = plans[0].config["progress"] == "none"
     plans, stop, failed = tuple(merged(plans)), Stop(), Failures()
     with stop.on_signals():

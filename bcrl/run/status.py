@@ -69,7 +69,14 @@ def diverging_lines(plan: Plan) -> list[str]:
 
 def _table(rows: dict[str, list[Any]], *columns: str) -> str:
     """Rows by name as aligned lines."""
-    import pandas as pd  # slow to import
-
-    table = pd.DataFrame.from_dict(rows, orient="index", columns=list(columns))
-    return table.to_string(float_format="{:.1f}".format)
+    shown = [["", *columns]]
+    for name, row in rows.items():
+        shown.append(
+            [name, *(f"{x:.1f}" if isinstance(x, float) else str(x) for x in row)]
+        )
+    name_width, *widths = (max(map(len, column)) for column in zip(*shown, strict=True))
+    lines = []
+    for name, *cells in shown:
+        right = (cell.rjust(w) for cell, w in zip(cells, widths, strict=True))
+        lines.append("  ".join([name.ljust(name_width), *right]))
+    return "\n".join(lines)

@@ -3,8 +3,9 @@
 import numba
 import pytest
 
-from bcrl.common import compiling
+from bcrl.common import compiling, numba_cache
 from bcrl.errors import BcrlError
+from bcrl.run import runner
 from tests.conftest import plan
 
 DAMAGES = {
@@ -37,9 +38,9 @@ def test_damaged_code_is_compiled_again_and_replaced(tmp_path, monkeypatch, dama
 
 
 def test_code_of_an_older_source_is_never_loaded_and_is_replaced(tmp_path):
-    older = compiling.Files(str(tmp_path), "f-1.py3", "older source")
+    older = numba_cache.Files(str(tmp_path), "f-1.py3", "older source")
     older.save("float", "older")
-    newer = compiling.Files(str(tmp_path), "f-1.py3", "newer source")
+    newer = numba_cache.Files(str(tmp_path), "f-1.py3", "newer source")
     assert newer.load("float") is None
     newer.save("float", "newer")
     assert (older.load("float"), newer.load("float")) == (None, "newer")
@@ -52,7 +53,7 @@ def test_without_a_folder_code_is_compiled_each_time(monkeypatch):
     assert not doubled(5) and not doubled(5)
 
 
-def test_numba_that_may_not_compile_is_reported(monkeypatch):
+def test_numba_that_may_not_compile_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
     with pytest.raises(BcrlError, match="NUMBA_DISABLE_JIT"):
-        plan("env=maze")
+        runner.run(plan("env=maze", f"runs_dir={tmp_path}"))

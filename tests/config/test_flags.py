@@ -54,7 +54,7 @@ def test_every_example_of_the_help_would_run(tmp_path, monkeypatch, capsys):
     assert everything(tmp_path) == []
 
 
-def test_help_and_tab_import_nothing_large(tmp_path):
+def test_help_tab_and_dry_run_import_nothing_large(tmp_path):
     program = """if True:
         import sys
         from bcrl.cli import main
@@ -65,7 +65,8 @@ def test_help_and_tab_import_nothing_large(tmp_path):
             large = {"torch", "numba", "scipy", "sklearn", "matplotlib", "pandas"}
             print(sorted(large & sys.modules.keys()), file=sys.stderr)
     """
-    for asked in (["--help"], ["-sc", "query=bash"]):
+    figures = ["-m", "experiment=fig1,fig4", "--dry-run"]
+    for asked in (["--help"], ["-sc", "query=bash"], figures):
         command = [sys.executable, "-c", program, *asked]
         there = {"cwd": tmp_path, "env": {**os.environ, "COMP_LINE": "bcrl env="}}
         done = subprocess.run(command, **there, capture_output=True, text=True)

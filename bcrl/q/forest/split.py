@@ -6,12 +6,11 @@ not depend on the order of rows or on the machine: a row of multiplicity 3 and t
 equal rows give the same tree. Indices are unsigned: numba checks signed ones for < 0.
 """
 
-from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from bcrl.common.compiling import compiled
 
 #: One tree node, 12 bytes: rows with `key <= cut` go to node `child`, others to
 #: `child + 1`; a leaf has feature −1 and its value at `child` in the leaf values.
@@ -28,9 +27,9 @@ HALF = np.int64(32)  # bits of a key in a word
 
 #: Functions that make no arrays need no reference counting, which costs more than the
 #: work in a small node.
-uncounted: Callable[[Callable], Callable] = partial(njit, _nrt=False)()
+uncounted = compiled(_nrt=False)
 #: The same, inlined into the caller, because passing arrays costs as much again.
-inlined: Callable[[Callable], Callable] = partial(njit, _nrt=False, inline="always")()
+inlined = compiled(_nrt=False, inline="always")
 
 
 @inlined

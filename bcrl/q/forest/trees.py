@@ -8,10 +8,9 @@ one plane into the next, without a branch, and reads memory in sequence.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from bcrl.common.compiling import kept
+from bcrl.common.compiling import compiled, kept
 from bcrl.q.forest.split import (
     NODE,
     U,
@@ -36,7 +35,7 @@ class Rows(NamedTuple):
     weight: NDArray[np.int64]  # (room,) multiplicities, or empty if all are 1
 
 
-@njit
+@compiled()
 def _new_rows(x, has_targets, weighted):
     """Rows whose first plane holds x (n, d) float32; targets and weights are unset."""
     n, d = U(x.shape[0]), U(x.shape[1])
