@@ -1,4 +1,4 @@
-"""Functions that numba compiles; numba, a slow import, is imported at the first call."""
+"""Functions that numba compiles; numba, a slow import, comes with the first call."""
 
 import functools
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from bcrl.errors import BcrlError
 
 
 class Compiled:
-    """A function that numba compiles when it is first called, or compiled code calls it.
+    """A function that numba compiles when it, or compiled code that uses it, is called.
 
     Every attribute is that of numba's dispatcher, so numba takes it for one.
     """
