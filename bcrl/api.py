@@ -100,14 +100,12 @@ def run(
     metrics: Sequence[str] = ("return", "solved"),
     threads: int | None = None,
     progress: bool = True,
-    evaluate_every: int = 1,
 ) -> pd.DataFrame:
     """Train seeds through the stages, in lockstep; one row per seed and evaluation.
 
-    FQI is evaluated every `evaluate_every` iterations and at each stage's end. Columns
-    are seed, stage, task, then iteration and `metrics` (FQI) or step and the metrics of
-    docs/reference/metrics.md (DQN). No seed's results depend on the others. Raises
-    BcrlError for seeds that diverge.
+    Columns are seed, stage, task, then iteration and `metrics` (FQI) or step and the
+    metrics of docs/reference/metrics.md (DQN); learners have `evaluate_every`. No
+    seed's results depend on the others. Raises BcrlError for seeds that diverge.
     """
     compiling.check()
     if isinstance(seeds, Integral):
@@ -125,8 +123,6 @@ def run(
     rows, length = [], sum(stage.learner.length for stage in stages)
     with tqdm(total=length, unit=probe.index, disable=not progress) as bar:
         for snapshot in learn(stages, batch):
-            if snapshot.count % evaluate_every and not snapshot.last_of_stage:
-                continue
             for seed, row in zip(seeds, probe.measure(snapshot), strict=True):
                 rows.append({"seed": seed} | probe.place(snapshot) | row)
             if lost := [f"seed {seeds[s]}: {why}" for s, why in probe.failed.items()]:

@@ -44,15 +44,15 @@ class SwingUp:
 
 
 tasks = [SwingUp(torque=torque) for torque in (8.0, 6.0, 4.0, 3.0)]
-learner = FQI(iterations=15, episodes=100, epsilon=0.3, regressor=Forest(trees=20))
+settings = {"iterations": 15, "evaluate_every": 15, "episodes": 100, "epsilon": 0.3}
+learner = FQI(**settings, regressor=Forest(trees=20))
 methods = {
     "FQI": stages(tasks[-1:] * 4, learner),
     "C-FQI": stages(tasks, learner),
     "BC-FQI": stages(tasks, learner, Boost()),
 }
 frames = {
-    name: run(each, seeds=range(3), progress=False, evaluate_every=15)
-    for name, each in methods.items()
+    name: run(each, seeds=range(3), progress=False) for name, each in methods.items()
 }
 results = pd.concat(frames, names=["method", "row"])
 

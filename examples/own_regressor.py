@@ -17,13 +17,13 @@ kernel = make_pipeline(
     StandardScaler(), Nystroem(gamma=0.5, n_components=100), Ridge(1e-3)
 )
 regressors = {"RBF": Sklearn(kernel), "forest": Forest(trees=20)}
+settings = {"iterations": 4, "evaluate_every": 4, "episodes": 100}
 frames = {
     name: run(
-        stages(tasks, FQI(iterations=4, episodes=100, regressor=regressor), Boost()),
+        stages(tasks, FQI(**settings, regressor=regressor), Boost()),
         seeds=range(2),
         metrics=("q_error", "return"),
         progress=False,
-        evaluate_every=4,
     )
     for name, regressor in regressors.items()
 }

@@ -12,7 +12,7 @@ from bcrl.envs import is_finite, is_simulated
 from bcrl.learning import Floats, dataset, rollout
 from bcrl.learning.bellman import residual_target, shaping
 from bcrl.learning.dataset import Dataset
-from bcrl.learning.stage import SeedBatch, Snapshot, Stage
+from bcrl.learning.stage import Pause, SeedBatch, Snapshot, Stage
 from bcrl.learning.transfer import StageInit, StageResult
 from bcrl.q.functions import NOT_FINITE, ZERO, Q, Table, Values, query
 from bcrl.q.regressors.base import Cell, Fitted, FittedQ, Problem, Regressor, fit_each
@@ -52,6 +52,7 @@ class FQI:
     new_data: bool = True  # False: learn from the previous stage's data again
     shared_data: bool = False  # [released] one dataset per task for all seeds
     fixed_trees: bool = False  # [released] the same randomness in every fit of a seed
+    evaluate_every: int = 1  # iterations of the stage; its last is always evaluated
 
     name: ClassVar[str] = "fqi"
 
@@ -62,7 +63,7 @@ class FQI:
 
     def learn(
         self, stage: Stage, start: StageInit, batch: SeedBatch, state: Any = None
-    ) -> Iterator[Iteration]:
+    ) -> Iterator[Pause]:
         """Learn a stage, ϱ ← S(T(base + ϱ) − base); yields after each iteration."""
         env, n_actions = stage.env, stage.env.n_actions
         state = state or self._collect(stage, start, batch)
@@ -117,13 +118,16 @@ class FQI:
                 total = [q + v[:, None] for q, v in zip(total, potential, strict=True)]
             bad = [s for s, q in enumerate(total) if not np.isfinite(q).all()]
             failed = dict.fromkeys(bad, NOT_FINITE) | failed
+            after, count = FQIState(k, data, residual, failed), stage.before + k
+            if k % self.evaluate_every and k < self.iterations:
+                yield Pause(stage, count, after)
+                continue
             if is_finite(env):
                 result = StageResult(Table(total, env), Table(residual, env), data)
             else:
                 own = FittedQ([tuple(row) for row in models], self.regressor, batch)
                 last = start if k == self.iterations else cached
                 result = StageResult(last.total(own), own, data)
-            after, count = FQIState(k, data, residual, failed), stage.before + k
             probed = (
                 [values[d.probe] for values, d in zip(each, data, strict=True)]
                 for each in (total, residual)

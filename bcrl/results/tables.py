@@ -38,15 +38,18 @@ def _disorder(table: pd.DataFrame) -> str:
     """What is wrong with a table's index columns; empty if nothing is."""
     if table.empty:
         return "has no rows"
-    count = np.arange(1, len(table) + 1)
-    if not np.array_equal(table.get("iteration", count), count):
-        return f"does not count iterations 1 to {len(table)}"
-    for column, least in (("step", 0), ("stage", 1), ("task", 1)):
+    for column, least in (("step", 0), ("iteration", 1), ("stage", 1), ("task", 1)):
         values = table.get(column, pd.Series([least]))
         if not ((values >= least) & (values % 1 == 0)).all():
             return f"has a {column} that is not a whole number ≥ {least}"
         if column != "task" and (np.diff(values) < 0).any():
             return f"has {column}s that fall"
+    last = 0.0
+    for stage, rows in table.groupby("stage") if "iteration" in table else ():
+        steps = np.diff(rows.iteration, prepend=last)  # equal, the last may be shorter
+        if (steps[:-1] != steps[0]).any() or not 0 < steps[-1] <= steps[0]:
+            return f"does not count stage {stage:.0f}'s iterations at one interval"
+        last = rows.iteration.iloc[-1]
     return ""
 
 

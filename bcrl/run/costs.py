@@ -1,7 +1,6 @@
 """The cost model of docs/explanation/cost.md, by environment and variant."""
 
 import heapq
-import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -29,21 +28,3 @@ def makespan(seconds: Iterable[float], workers: int) -> float:
     for job in seconds:
         heapq.heapreplace(free, free[0] + job)
     return max(free)
-
-
-def memory_note(plan: Plan) -> str | None:
-    """A warning if the data of seeds that train together may not fit into memory."""
-    needed = 0
-    for stage in plan.stages:
-        env, learner = stage.env, stage.learner
-        evaluated = 2 * getattr(learner, "evaluation_episodes", 0)
-        episodes = max(getattr(learner, "episodes", 0), evaluated)
-        states = 2 * 8 * episodes * (env.horizon + 1) * env.state_dim  # and a copy
-        row = 4 * (2 * env.state_dim + env.n_actions + 3)
-        needed = max(needed, states + row * getattr(learner, "replay_size", 0))
-    needed *= min(plan.lockstep, len(plan.seeds))
-    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed <= there:
-        return None
-    sizes = f"{needed / 2**30:.1f} of {there / 2**30:.1f} GiB of memory"
-    return f"the data may take {sizes}; seeds.lockstep=1 or fewer episodes take less"

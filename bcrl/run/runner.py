@@ -12,7 +12,7 @@ from bcrl.errors import BcrlError
 from bcrl.evaluation import oracle
 from bcrl.evaluation.metrics import needs_reference
 from bcrl.results.layout import COMPLETE, seed_name
-from bcrl.run import checkpoints, costs, job, locks, records, status
+from bcrl.run import checkpoints, job, locks, memory, records, status
 from bcrl.run.origin import run_origin
 from bcrl.run.progress import Progress
 from bcrl.run.schedule import Failures, Job, merged, ordered
@@ -81,8 +81,6 @@ def _prepare(plan: Plan, quiet: bool) -> None:
     checkpoints.remove_done(plan)
     name = f"{plan.env} {plan.name}"
     states = {seed: records.state(plan.directory, seed) for seed in plan.seeds}
-    if note := costs.memory_note(plan):
-        say(f"{name}: {note}")
     for line in records.problems(f"bcrl: {name}", states):
         say(f"{line}; it is computed again")
     done = sum(state == COMPLETE for state, _ in states.values())
@@ -96,6 +94,7 @@ def _train(jobs: Sequence[Job], failed: Failures, stop: Stop) -> None:
         if plan.family == "FQI" and needs_reference(plan.metrics):
             for task in (plan.target, *(stage.env for stage in plan.stages)):
                 oracle.reference(task)  # without Q*, the command ends before any work
+    memory.check(jobs)
     options = jobs[0].plan.config
     workers = min(options["workers"], len(jobs))
     threads = options["threads"] or max(1, cores() // workers)

@@ -128,6 +128,23 @@ def test_evaluating_dqn_twice_as_often_leaves_training_unchanged(tmp_path):
     assert found[0] == {step: found[1][step] for step in found[0]}
 
 
+def test_fqi_is_evaluated_seldom_outside_of_the_paper_and_its_results_are_sound(
+    tmp_path,
+):
+    for words in (["env=maze"], ["env=car_on_hill"]):
+        learners = [stage.learner for stage in plan(*words, "scale=paper").stages]
+        assert {learner.evaluate_every for learner in learners} == {1}
+    # An evaluation of 20 starts may cost 4 · (260 + 2 · 20) = 1200 of the fitted rows.
+    for iterations, episodes, every in ((20, 100, 20), (25, 100, 13), (50, 300, 5)):
+        sizes = f"algorithm.iterations={iterations}", f"algorithm.episodes={episodes}"
+        stages = plan("env=mountain_car", *sizes).stages
+        assert {stage.learner.evaluate_every for stage in stages} == {every}
+    words = (*TABULAR, "curriculum=off", "algorithm.iterations=5", "scale=quick")
+    p = run(tmp_path, *words, "algorithm.evaluate_every=3", "seeds=1")
+    assert [row["iteration"] for row in rows(p, 0)][:4] == [3, 5, 8, 10]
+    assert check_tree(tmp_path)[1] == []
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_a_gpu_run_is_much_like_a_cpu_run(tmp_path):
     here = run(tmp_path / "cpu", *LINEAR, "variant=BC")
