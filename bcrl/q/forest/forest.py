@@ -18,7 +18,8 @@ from itertools import pairwise
 import numpy as np
 
 from bcrl.errors import BcrlError, at_least
-from bcrl.q.forest.trees import grow_forest, predict_forest
+from bcrl.q.forest.descent import predict_forest
+from bcrl.q.forest.trees import grow_forest
 
 _pool = cache(ThreadPoolExecutor)  # starting threads costs more than a small call
 

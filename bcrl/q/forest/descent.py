@@ -1,0 +1,137 @@
+"""Compiled prediction: rows go down the trees of a grown forest.
+
+Many rows are sorted down a tree together; few rows walk down side by side, in several
+trees at once, so that the processor overlaps their reads. Neither way has a branch that
+depends on a row, and both add a row's values in the order of the trees.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from bcrl.common.compiling import kept
+from bcrl.q.forest.split import U, key_of, uncounted
+
+TOGETHER = 2000  # from so many rows on, it is faster to sort them down a tree
+WALKERS = 1024  # pairs of a row and a tree that walk side by side
+CACHED = 2**19  # keys of the rows that are sorted together: 2 MiB
+
+
+class Descent(NamedTuple):
+    """The rows (m, d) that go down, and memory for their way."""
+
+    keys: NDArray[np.int32]  # (m · d,)
+    d: int
+    one: NDArray[np.uint32]  # two planes of rows that are sorted; nodes of walkers
+    other: NDArray[np.uint32]  # and the walkers that have not arrived
+    begins: NDArray[np.uint32]  # where the keys of a walker's row begin
+    stack: NDArray[np.int64]
+
+
+@njit
+def new_descent(x):
+    """The descent of x (m, d) float32."""
+    m, d = x.shape
+    keys = np.empty(m * d, np.int32)
+    for i in range(m):
+        for f in range(d):
+            keys[i * d + f] = key_of(x[i, f])
+    room = max(m, WALKERS)
+    one, other = np.empty(room, np.uint32), np.empty(room, np.uint32)
+    begins = np.empty(room, np.uint32)
+    stack = np.empty((m + 1 if m >= TOGETHER else 0, 4), np.int64)
+    return Descent(keys, d, one, other, begins, stack)
+
+
+@uncounted
+def _sort_down(nodes, values, root, descent, begin, end, total):
+    """Add one tree's predictions to `total`, sorting the rows begin:end down it.
+
+    A node's rows lie in one plane and are sorted into the other by its cut.
+    """
+    keys, d, one, other, _, stack = descent
+    width, node, depth, top = U(d), root, 0, 0
+    start, stop = U(begin), U(end)
+    for i in range(start, stop):
+        one[i] = np.uint32(i)
+    while True:
+        child, feature, cut = nodes[node].child, nodes[node].feature, nodes[node].cut
+        here, there = (other, one) if depth & 1 else (one, other)
+        if feature < 0:
+            for i in range(start, stop):
+                total[here[i]] += values[child]
+        else:
+            left, right, column = start, stop - U(1), U(feature)
+            for i in range(start, stop):
+                row = here[i]
+                goes_left = U(keys[U(row) * width + column] <= cut)
+                there[left], there[right] = row, row  # the next row corrects one
+                left += goes_left
+                right -= U(1) - goes_left
+            depth += 1
+            if left < stop:
+                stack[top, 0], stack[top, 1] = child + 1, depth
+                stack[top, 2], stack[top, 3] = left, stop
+                top += 1
+            if start < left:
+                node, stop = np.int64(child), left
+                continue
+        if top == 0:
+            return
+        top -= 1
+        node, depth = stack[top, 0], stack[top, 1]
+        start, stop = U(stack[top, 2]), U(stack[top, 3])
+
+
+@uncounted
+def _walk_down(nodes, values, first, start, stop, descent, total):
+    """Add the predictions of trees start:stop to `total`, level by level."""
+    keys, d, at, who, begins, _ = descent
+    m, left = U(total.size), U(0)
+    for t in range(start, stop):
+        for i in range(m):
+            at[left], who[left] = np.uint32(first[t]), np.uint32(left)
+            begins[left] = np.uint32(i * U(d))
+            left += U(1)
+    while left > U(0):
+        kept = U(0)
+        for j in range(left):
+            walker = U(who[j])
+            node = nodes[U(at[walker])]
+            inner = node.feature >= 0
+            right = keys[U(begins[walker]) + U(max(node.feature, 0))] > node.cut
+            at[walker] = np.uint32(node.child + right) if inner else at[walker]
+            who[kept] = np.uint32(walker)
+            kept += U(inner)
+        left = kept
+    walker = U(0)
+    for _ in range(start, stop):
+        for i in range(m):
+            total[i] += values[nodes[U(at[walker])].child]
+            walker += U(1)
+
+
+@njit
+def add_trees(nodes, values, first, start, stop, descent, total):
+    """Add the predictions of trees start:stop to `total` (m,), in their order."""
+    m = total.size
+    if m >= TOGETHER:
+        part = max(1, CACHED // descent.d)
+        for begin in range(0, m, part):
+            for t in range(start, stop):
+                end = min(m, begin + part)
+                _sort_down(nodes, values, first[t], descent, begin, end, total)
+    elif m > 0:
+        some = max(1, WALKERS // m)
+        for t in range(start, stop, some):
+            _walk_down(nodes, values, first, t, min(stop, t + some), descent, total)
+
+
+@kept(nogil=True)
+def predict_forest(nodes, values, first, x):
+    """Mean over the trees at x (m, d) float32, as float64 (m,)."""
+    trees, total = first.size - 1, np.zeros(x.shape[0])
+    add_trees(nodes, values, first, 0, trees, new_descent(x), total)
+    return total / trees
