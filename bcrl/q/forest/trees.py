@@ -85,15 +85,18 @@ def _move_rows(rows, n, width, depth, start, stop, feature, cut):
     else:
         for i in range(start, stop):
             goes_left = U(keys[(a + i) * width + U(feature)] <= cut)
-            to = left if goes_left else right
-            for g in range(U(0), width, U(LANES)):
-                store(keys, (b + to) * width + g, load(keys, (a + i) * width + g))
+            to = left + ((stop - U(1) - i) & (goes_left - U(1)))
+            source, there = (a + i) * width, (b + to) * width
+            store(keys, there, load(keys, source))
+            more = U(LANES)
+            while more < width:
+                store(keys, there + more, load(keys, source + more))
+                more += U(LANES)
             origin[b + to] = origin[a + i]
             target[b + to] = target[a + i]
             if weight.size > 0:
                 weight[b + to] = weight[a + i]
             left += goes_left
-            right -= U(1) - goes_left
     return left
 
 
