@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from bcrl.common.compiling import kept
 from bcrl.q.forest.split import U, key_of, uncounted
 
-TOGETHER = 2000  # from so many rows on, it is faster to sort them down a tree
+#: Sorting rows down a tree is faster from so many rows on, or from a quarter of the
+#: tree's nodes on, which is measured as everything here: docs/decisions.md.
+TOGETHER = 1000
 WALKERS = 1024  # pairs of a row and a tree that walk side by side
 CACHED = 2**19  # keys of the rows that are sorted together: 2 MiB
 
@@ -41,7 +43,7 @@ def new_descent(x):
     room = max(m, WALKERS)
     one, other = np.empty(room, np.uint32), np.empty(room, np.uint32)
     begins = np.empty(room, np.uint32)
-    stack = np.empty((m + 1 if m >= TOGETHER else 0, 4), np.int64)
+    stack = np.empty((m + 1, 4), np.int64)  # memory that is not used is free
     return Descent(keys, d, one, other, begins, stack)
 
 
@@ -116,8 +118,8 @@ def _walk_down(nodes, values, first, start, stop, descent, total):
 @njit
 def add_trees(nodes, values, first, start, stop, descent, total):
     """Add the predictions of trees start:stop to `total` (m,), in their order."""
-    m = total.size
-    if m >= TOGETHER:
+    m, size = total.size, (first[stop] - first[start]) // (stop - start)
+    if m >= min(TOGETHER, size // 4):
         part = max(1, CACHED // descent.d)
         for begin in range(0, m, part):
             for t in range(start, stop):
@@ -135,3 +137,15 @@ def predict_forest(nodes, values, first, x):
     trees, total = first.size - 1, np.zeros(x.shape[0])
     add_trees(nodes, values, first, 0, trees, new_descent(x), total)
     return total / trees
+
+
+@kept(nogil=True)
+def predict_stack(nodes, values, first, trees, x, begins):
+    """Means over trees[k]:trees[k+1] at the rows begins[k]:begins[k+1] of x (m, d)."""
+    total = np.zeros(x.shape[0])
+    for k in range(trees.size - 1):
+        rows, start, stop = x[begins[k] : begins[k + 1]], trees[k], trees[k + 1]
+        own = total[begins[k] : begins[k + 1]]
+        add_trees(nodes, values, first, start, stop, new_descent(rows), own)
+        own /= stop - start
+    return total

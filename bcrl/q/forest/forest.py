@@ -18,7 +18,7 @@ from itertools import pairwise
 import numpy as np
 
 from bcrl.errors import BcrlError, at_least
-from bcrl.q.forest.descent import predict_forest
+from bcrl.q.forest.descent import predict_forest, predict_stack
 from bcrl.q.forest.trees import grow_forest
 
 _pool = cache(ThreadPoolExecutor)  # starting threads costs more than a small call
@@ -106,6 +106,31 @@ def join(forests: Sequence[Forest]) -> Forest:
     values = np.concatenate([forest.values for forest in forests])
     depths = np.concatenate([forest.depths for forest in forests])
     return Forest(nodes, values, np.concatenate(first), depths, forests[0].n_features)
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Many forests that predict in one compiled call, each at its own points."""
+
+    joint: Forest  # the trees of all
+    trees: np.ndarray  # (F+1,) int64, where each forest's trees begin
+
+    @classmethod
+    def of(cls, forests: Sequence[Forest]) -> "Stack":
+        """The stack of `forests`, at least one, of equally many features."""
+        trees = np.cumsum([0, *(len(forest.depths) for forest in forests)])
+        return cls(join(forests), trees)
+
+    def predict(self, x: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """The predictions (n,) of each forest at its own x (n, d), bit for bit."""
+        begins = np.cumsum([0, *map(len, x)])
+        if len(begins) != len(self.trees):
+            raise BcrlError(f"{len(x)} sets of points for {len(self.trees) - 1} forests")
+        joint, points = self.joint, np.concatenate(x, dtype=np.float32)
+        points = _points("x", points, joint.n_features)
+        tree = joint.nodes, joint.values, joint.first
+        total = predict_stack(*tree, self.trees, points, begins)
+        return np.split(total, begins[1:-1])
 
 
 def importances(

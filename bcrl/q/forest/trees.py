@@ -69,34 +69,26 @@ def _move_rows(rows, n, width, depth, start, stop, feature, cut):
     """Move a node's rows to its children's plane; returns the left child's end."""
     keys, words, origin, target, weight = rows
     a, b = _plane(depth) * n, _plane(depth + 1) * n
-    left, right = start, stop - U(1)
-    shift = np.int64(32) * feature
-    if width == U(2):
-        for i in range(start, stop):
+    left, end, shift = start, stop - U(1), np.int64(32) * feature
+    for i in range(start, stop):
+        if width == U(2):
             word = words[a + i]
             goes_left = U(np.int32(word >> shift) <= cut)
-            to = left if goes_left else right
-            words[b + to], origin[b + to] = word, origin[a + i]
-            target[b + to] = target[a + i]
-            if weight.size > 0:
-                weight[b + to] = weight[a + i]
-            left += goes_left
-            right -= U(1) - goes_left
-    else:
-        for i in range(start, stop):
-            goes_left = U(keys[(a + i) * width + U(feature)] <= cut)
-            to = left + ((stop - U(1) - i) & (goes_left - U(1)))
-            source, there = (a + i) * width, (b + to) * width
+            to = left + ((end - i) & (goes_left - U(1)))  # a select became a branch
+            words[b + to] = word
+        else:
+            source = (a + i) * width
+            goes_left = U(keys[source + U(feature)] <= cut)
+            to = left + ((end - i) & (goes_left - U(1)))
+            there, more = (b + to) * width, U(LANES)
             store(keys, there, load(keys, source))
-            more = U(LANES)
             while more < width:
                 store(keys, there + more, load(keys, source + more))
                 more += U(LANES)
-            origin[b + to] = origin[a + i]
-            target[b + to] = target[a + i]
-            if weight.size > 0:
-                weight[b + to] = weight[a + i]
-            left += goes_left
+        origin[b + to], target[b + to] = origin[a + i], target[a + i]
+        if weight.size > 0:
+            weight[b + to] = weight[a + i]
+        left += goes_left
     return left
 
 
@@ -205,11 +197,13 @@ def grow_forest(x, y, multiplicity, seeds, queries, settings, keep):
     tree = np.empty(2 * room, NODE), np.empty(room, np.float64)
     whole, leaves = (weight, total, 2.0**-bits), 0
     for t in range(trees):
-        at = (first[t], leaves) if keep else (0, 0)
         buffers = rows, width, whole, settings, seeds[t], work
-        at, depths[t] = _grow_tree(*buffers, fitted, tree, at)
-        add_trees(*tree, first, t, t+1, descent, queried)
+        at, depths[t] = _grow_tree(*buffers, fitted, tree, (first[t], leaves))
+        first[t + 1], grown = at
+        add_trees(*tree, first, t, t + 1, descent, queried)
         if keep:
-            first[t + 1], leaves = at
+            leaves = grown
+        else:  # the next tree takes the place of this one
+            first[t + 1] = 0
     nodes, values = tree[0][: first[trees]].copy(), tree[1][:leaves].copy()
     return nodes, values, first, depths, fitted / trees, queried / trees
