@@ -9,8 +9,8 @@ from sklearn.ensemble import ExtraTreesRegressor
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from bcrl.errors import BcrlError, ConfigError
-from bcrl.q.forest.estimator import ExtraTrees
 from bcrl.q.forest import descent, lanes, split, trees
+from bcrl.q.forest.estimator import ExtraTrees
 from bcrl.q.forest.forest import (
     Regression,
     Stack,

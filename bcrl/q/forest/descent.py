@@ -1,8 +1,8 @@
 """Compiled prediction: rows go down the trees of a grown forest.
 
-Many rows are sorted down a tree together; few rows walk down side by side, in several
-trees at once, so that the processor overlaps their reads. Neither way has a branch that
-depends on a row, and both add a row's values in the order of the trees.
+Many rows are sorted down a tree together; few rows walk down side by side, a level at a
+time, so that the processor overlaps their reads. Neither way branches on a row's side,
+and both add a row's values in the order of the trees.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,6 @@ from bcrl.q.forest.split import U, key_of, uncounted
 #: Sorting rows down a tree is faster from so many rows on, or from a quarter of the
 #: tree's nodes on, which is measured as everything here: docs/decisions.md.
 TOGETHER = 1000
-WALKERS = 1024  # pairs of a row and a tree that walk side by side
 CACHED = 2**19  # keys of the rows that are sorted together: 2 MiB
 
 
@@ -26,9 +25,8 @@ class Descent(NamedTuple):
 
     keys: NDArray[np.int32]  # (m · d,)
     d: int
-    one: NDArray[np.uint32]  # two planes of rows that are sorted; nodes of walkers
-    other: NDArray[np.uint32]  # and the walkers that have not arrived
-    begins: NDArray[np.uint32]  # where the keys of a walker's row begin
+    one: NDArray[np.uint32]  # two planes of rows that are sorted; or each row's node
+    other: NDArray[np.uint32]  # and the rows that are not in a leaf
     stack: NDArray[np.int64]
 
 
@@ -40,11 +38,9 @@ def new_descent(x):
     for i in range(m):
         for f in range(d):
             keys[i * d + f] = key_of(x[i, f])
-    room = max(m, WALKERS)
-    one, other = np.empty(room, np.uint32), np.empty(room, np.uint32)
-    begins = np.empty(room, np.uint32)
+    one, other = np.empty(m, np.uint32), np.empty(m, np.uint32)
     stack = np.empty((m + 1, 4), np.int64)  # memory that is not used is free
-    return Descent(keys, d, one, other, begins, stack)
+    return Descent(keys, d, one, other, stack)
 
 
 @uncounted
@@ -53,7 +49,7 @@ def _sort_down(nodes, values, root, descent, begin, end, total):
 
     A node's rows lie in one plane and are sorted into the other by its cut.
     """
-    keys, d, one, other, _, stack = descent
+    keys, d, one, other, stack = descent
     width, node, depth, top = U(d), root, 0, 0
     start, stop = U(begin), U(end)
     for i in range(start, stop):
@@ -88,47 +84,41 @@ def _sort_down(nodes, values, root, descent, begin, end, total):
 
 
 @uncounted
-def _walk_down(nodes, values, first, start, stop, descent, total):
-    """Add the predictions of trees start:stop to `total`, level by level."""
-    keys, d, at, who, begins, _ = descent
-    m, left = U(total.size), U(0)
-    for t in range(start, stop):
-        for i in range(m):
-            at[left], who[left] = np.uint32(first[t]), np.uint32(left)
-            begins[left] = np.uint32(i * U(d))
-            left += U(1)
+def _walk_down(nodes, values, root, descent, total):
+    """Add one tree's predictions to `total`, all rows level by level."""
+    keys, d, at, walking, _ = descent
+    m, width = U(total.size), U(d)
+    for i in range(m):
+        at[i], walking[i] = np.uint32(root), np.uint32(i)
+    left = m
     while left > U(0):
         kept = U(0)
         for j in range(left):
-            walker = U(who[j])
-            node = nodes[U(at[walker])]
+            row = U(walking[j])
+            node = nodes[U(at[row])]
             inner = node.feature >= 0
-            right = keys[U(begins[walker]) + U(max(node.feature, 0))] > node.cut
-            at[walker] = np.uint32(node.child + right) if inner else at[walker]
-            who[kept] = np.uint32(walker)
+            right = keys[row * width + U(max(node.feature, 0))] > node.cut
+            at[row] = np.uint32(node.child + right) if inner else at[row]
+            walking[kept] = np.uint32(row)
             kept += U(inner)
         left = kept
-    walker = U(0)
-    for _ in range(start, stop):
-        for i in range(m):
-            total[i] += values[nodes[U(at[walker])].child]
-            walker += U(1)
+    for i in range(m):
+        total[i] += values[nodes[U(at[i])].child]
 
 
 @njit
 def add_trees(nodes, values, first, start, stop, descent, total):
     """Add the predictions of trees start:stop to `total` (m,), in their order."""
     m, size = total.size, (first[stop] - first[start]) // (stop - start)
-    if m >= min(TOGETHER, size // 4):
+    if m >= min(TOGETHER, size // 4 + 1):
         part = max(1, CACHED // descent.d)
         for begin in range(0, m, part):
             for t in range(start, stop):
                 end = min(m, begin + part)
                 _sort_down(nodes, values, first[t], descent, begin, end, total)
-    elif m > 0:
-        some = max(1, WALKERS // m)
-        for t in range(start, stop, some):
-            _walk_down(nodes, values, first, t, min(stop, t + some), descent, total)
+    else:
+        for t in range(start, stop):
+            _walk_down(nodes, values, first[t], descent, total)
 
 
 @kept(nogil=True)

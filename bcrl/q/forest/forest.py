@@ -125,7 +125,9 @@ class Stack:
         """The predictions (n,) of each forest at its own x (n, d), bit for bit."""
         begins = np.cumsum([0, *map(len, x)])
         if len(begins) != len(self.trees):
-            raise BcrlError(f"{len(x)} sets of points for {len(self.trees) - 1} forests")
+            raise BcrlError(
+                f"{len(x)} sets of points for {len(self.trees) - 1} forests"
+            )
         joint, points = self.joint, np.concatenate(x, dtype=np.float32)
         points = _points("x", points, joint.n_features)
         tree = joint.nodes, joint.values, joint.first

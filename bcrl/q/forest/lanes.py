@@ -5,12 +5,12 @@ as LLVM vectors, which become SIMD instructions on any processor. Keys are padde
 whole vectors; nothing that is found in the padding is used.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
-from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
 from bcrl.q.forest.split import (
@@ -26,6 +26,9 @@ from bcrl.q.forest.split import (
 
 LANES = 4  # of int32 keys in a vector; wide enough for AVX2, whose int64 sums are four
 CHUNK = U(128)  # rows that stay in the cache while all vectors of a row are read
+
+#: A function that builds LLVM code for calls of itself.
+instructions: Callable[[Callable], Callable] = intrinsic
 
 
 class Vector(types.Type):
@@ -50,18 +53,18 @@ def _place(context, b, signature, args):
     return b.bitcast(start, lanes.as_pointer()), kind.dtype.bitwidth // 8
 
 
-@intrinsic
+@instructions
 def load(typing, array, i):
     """The vector array[i : i + LANES]."""
 
     def generate(context, b, signature, args):
         where, align = _place(context, b, signature, args)
-        return b.load(where, align=align, typ=signature.return_type.lanes)
+        return b.load(where, align=align)
 
     return Vector(array.dtype.bitwidth)(array, types.uint64), generate
 
 
-@intrinsic
+@instructions
 def store(typing, array, i, vector):
     """array[i : i + LANES] = vector."""
 
@@ -72,7 +75,7 @@ def store(typing, array, i, vector):
     return types.void(array, types.uint64, vector), generate
 
 
-@intrinsic
+@instructions
 def lesser(typing, one, other):
     """The lesser of two vectors, lane by lane."""
 
@@ -82,7 +85,7 @@ def lesser(typing, one, other):
     return one(one, other), generate
 
 
-@intrinsic
+@instructions
 def greater(typing, one, other):
     """The greater of two vectors, lane by lane."""
 
@@ -92,7 +95,7 @@ def greater(typing, one, other):
     return one(one, other), generate
 
 
-@intrinsic
+@instructions
 def add_left(typing, total, keys, cuts, value):
     """`total` (int64) plus `value` in the lanes where keys <= cuts."""
 
@@ -143,7 +146,7 @@ def choose_all(
         feature = order[pick]
         order[pick], order[left] = order[left], feature
         cuts[feature] = draw_cut(low[feature], high[feature], bits >> U(32))
-        
+
     for g in range(U(0), width):
         weights[g] = totals[g] = 0
     for start in range(first, last, CHUNK):

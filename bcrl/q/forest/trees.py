@@ -128,7 +128,15 @@ def _grow_tree(rows, width, whole, settings, state, work, fitted, tree, at):
             if max_features < order.size:
                 limits = min_leaf, max_features
                 split, state = choose(
-                    rows, width, first, last, node_weight, node_total, limits, state, order
+                    rows,
+                    width,
+                    first,
+                    last,
+                    node_weight,
+                    node_total,
+                    limits,
+                    state,
+                    order,
                 )
             elif width == U(2):
                 split, state = choose_two(
@@ -136,7 +144,15 @@ def _grow_tree(rows, width, whole, settings, state, work, fitted, tree, at):
                 )
             else:
                 split, state = choose_all(
-                    rows, first, last, node_weight, node_total, min_leaf, state, order, sums
+                    rows,
+                    first,
+                    last,
+                    node_weight,
+                    node_total,
+                    min_leaf,
+                    state,
+                    order,
+                    sums,
                 )
             feature, cut, w_left, s_left = split
         if feature < 0:
