@@ -176,13 +176,13 @@ def test_predictions_while_growing_are_the_forests_bit_for_bit(d):
     rng = np.random.default_rng(d)
     x, queries = rng.normal(size=(900, d)), rng.normal(size=(2000, d))
     y = rng.normal(size=900)
-    assert len(queries) > descent.TOGETHER  # and in two parts, of 300 features
-    assert descent.CACHED // 300 < len(queries) < descent.CACHED // 3
+    assert descent.CACHED // 300 < len(queries) < descent.CACHED // 3  # in two parts
     fit = fit_forests([Regression(x, y, seeds(7), None, queries)], PAPER)[0]
     assert (fit.forest.predict(x) == fit.fitted).all()
     assert (fit.forest.predict(queries) == fit.queried).all()
-    # Few rows are walked one by one, many are moved together.
-    few = [fit.forest.predict(part) for part in np.array_split(queries, 50)]
+    # Few rows are walked down the trees, many are sorted down.
+    few = [fit.forest.predict(part) for part in np.array_split(queries, 100)]
+    assert len(queries) / 100 < descent.TOGETHER < len(queries) / 3
     assert (np.concatenate(few) == fit.queried).all()
 
 

@@ -2,7 +2,7 @@
 
 Many rows are sorted down a tree together; few rows walk down side by side, a level at a
 time, so that the processor overlaps their reads. Neither way branches on a row's side,
-and both add a row's values in the order of the trees.
+and both add a row's values in the order of the trees: they give the same bytes.
 """
 
 from typing import NamedTuple
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from bcrl.common.compiling import kept
 from bcrl.q.forest.split import U, key_of, uncounted
 
-#: Sorting rows down a tree is faster from so many rows on, or from a quarter of the
-#: tree's nodes on, which is measured as everything here: docs/decisions.md.
-TOGETHER = 1000
+#: So many rows, and one more for SHARE nodes of a tree, are sorted faster than walked.
+TOGETHER, SHARE = 32, 50
+SIDE_BY_SIDE = U(16)  # rows that walk down a tree together
 CACHED = 2**19  # keys of the rows that are sorted together: 2 MiB
 
 
@@ -25,8 +25,8 @@ class Descent(NamedTuple):
 
     keys: NDArray[np.int32]  # (m · d,)
     d: int
-    one: NDArray[np.uint32]  # two planes of rows that are sorted; or each row's node
-    other: NDArray[np.uint32]  # and the rows that are not in a leaf
+    one: NDArray[np.uint32]  # (m,) each: the rows, sorted from one into the other
+    other: NDArray[np.uint32]  # and back; or the nodes that rows have walked to
     stack: NDArray[np.int64]
 
 
@@ -85,32 +85,30 @@ def _sort_down(nodes, values, root, descent, begin, end, total):
 
 @uncounted
 def _walk_down(nodes, values, root, descent, total):
-    """Add one tree's predictions to `total`, all rows level by level."""
-    keys, d, at, walking, _ = descent
-    m, width = U(total.size), U(d)
-    for i in range(m):
-        at[i], walking[i] = np.uint32(root), np.uint32(i)
-    left = m
-    while left > U(0):
-        kept = U(0)
-        for j in range(left):
-            row = U(walking[j])
-            node = nodes[U(at[row])]
-            inner = node.feature >= 0
-            right = keys[row * width + U(max(node.feature, 0))] > node.cut
-            at[row] = np.uint32(node.child + right) if inner else at[row]
-            walking[kept] = np.uint32(row)
-            kept += U(inner)
-        left = kept
-    for i in range(m):
-        total[i] += values[nodes[U(at[i])].child]
+    """Add one tree's predictions to `total`, a few rows at a time, level by level."""
+    keys, width, at, m = descent.keys, U(descent.d), descent.one, U(total.size)
+    for begin in range(U(0), m, SIDE_BY_SIDE):
+        end = min(m, begin + SIDE_BY_SIDE)
+        for i in range(begin, end):
+            at[i] = np.uint32(root)
+        walking = True
+        while walking:
+            walking = False
+            for i in range(begin, end):
+                node = nodes[U(at[i])]
+                inner = node.feature >= 0
+                right = keys[i * width + U(max(node.feature, 0))] > node.cut
+                at[i] = np.uint32(node.child + right) if inner else at[i]
+                walking |= inner
+        for i in range(begin, end):
+            total[i] += values[nodes[U(at[i])].child]
 
 
 @njit
 def add_trees(nodes, values, first, start, stop, descent, total):
     """Add the predictions of trees start:stop to `total` (m,), in their order."""
     m, size = total.size, (first[stop] - first[start]) // (stop - start)
-    if m >= min(TOGETHER, size // 4 + 1):
+    if m >= TOGETHER + size // SHARE:
         part = max(1, CACHED // descent.d)
         for begin in range(0, m, part):
             for t in range(start, stop):
