@@ -69,34 +69,34 @@ def _move_rows(rows, n, width, depth, start, stop, feature, cut):
     """Move a node's rows to its children's plane; returns the left child's end."""
     keys, words, origin, target, weight = rows
     a, b = _plane(depth) * n, _plane(depth + 1) * n
-    left, end, shift = start, stop - U(1), np.int64(32) * feature
-    for i in range(start, stop):
-        if width == U(2):
+    left, right = start, stop - U(1)
+    if width == U(2):
+        shift = np.int64(32) * feature
+        for i in range(start, stop):
             word = words[a + i]
             goes_left = U(np.int32(word >> shift) <= cut)
-            to = left + ((end - i) & (goes_left - U(1)))  # a select became a branch
-            words[b + to] = word
-        else:
+            to = left if goes_left else right
+            words[b + to], origin[b + to] = word, origin[a + i]
+            target[b + to] = target[a + i]
+            if weight.size > 0:
+                weight[b + to] = weight[a + i]
+            left += goes_left
+            right -= U(1) - goes_left
+    else:
+        for i in range(start, stop):
             source = (a + i) * width
             goes_left = U(keys[source + U(feature)] <= cut)
-            to = left + ((end - i) & (goes_left - U(1)))
+            to = left + ((right - i) & (goes_left - U(1)))  # a choice became a branch
             there, more = (b + to) * width, U(LANES)
             store(keys, there, load(keys, source))
             while more < width:
                 store(keys, there + more, load(keys, source + more))
                 more += U(LANES)
-        origin[b + to], target[b + to] = origin[a + i], target[a + i]
-        if weight.size > 0:
-            weight[b + to] = weight[a + i]
-        left += goes_left
+            origin[b + to], target[b + to] = origin[a + i], target[a + i]
+            if weight.size > 0:
+                weight[b + to] = weight[a + i]
+            left += goes_left
     return left
-
-
-@inlined
-def _add_value(origin, start, stop, value, total):
-    """Add a leaf's value to `total` at its rows start:stop."""
-    for i in range(start, stop):
-        total[origin[i]] += value
 
 
 @uncounted
