@@ -144,7 +144,7 @@ def test_multiplicities_are_repeated_rows_bit_for_bit(name, most):
     assert memory <= 16.2 * len(one.forest.nodes)  # bytes
 
 
-@pytest.mark.parametrize("d", [1, 3, 4, 7, 33])
+@pytest.mark.parametrize("d", [3, 4, 7, 33])
 @pytest.mark.parametrize("weighted", [False, True])
 def test_splits_by_vectors_are_the_scalar_references_bit_for_bit(d, weighted):
     rng = np.random.default_rng(d)
@@ -184,6 +184,13 @@ def test_predictions_while_growing_are_the_forests_bit_for_bit(d):
     few = [fit.forest.predict(part) for part in np.array_split(queries, 100)]
     assert len(queries) / 100 < descent.TOGETHER < len(queries) / 3
     assert (np.concatenate(few) == fit.queried).all()
+
+
+def test_one_feature_has_the_trees_of_two_of_which_one_is_constant():
+    x, y = hill(500, 0)
+    tasks = [Regression(rows, y, seeds(5)) for rows in (x[:, :1], x * [1, 0])]
+    one, two = (fit.forest for fit in fit_forests(tasks, PAPER))
+    assert one.nodes.tobytes() == two.nodes.tobytes()
 
 
 def test_neither_threads_nor_other_forests_nor_keeping_change_a_forest():

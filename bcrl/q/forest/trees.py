@@ -29,8 +29,8 @@ from bcrl.q.forest.split import (
 class Rows(NamedTuple):
     """The buffers of n rows of d features; `room` is 3 n."""
 
-    keys: NDArray[np.int32]  # (width · room,): the keys of a row are neighbours
-    words: NDArray[np.int64]  # the same memory: with d = 2, a word is a row
+    keys: NDArray[np.int32]  # (width · room,): those of a row are neighbours
+    words: NDArray[np.int64]  # the same memory: with width 2, a word is a row
     origin: NDArray[np.uint32]  # (room,): the index that the row was given under
     target: NDArray[np.int64]  # (room,)
     weight: NDArray[np.int64]  # (room,) multiplicities, or empty if all are 1
@@ -38,8 +38,11 @@ class Rows(NamedTuple):
 
 @njit
 def _width(d):
-    """The keys of a row in memory: 2, or d rounded up to whole vectors."""
-    return U(2) if d == 2 else U((d + LANES - 1) // LANES * LANES)
+    """The keys of a row in memory: 2, or d > 2 rounded up to whole vectors.
+
+    One feature has a constant one beside it, which is never chosen.
+    """
+    return U(2) if d <= 2 else U((d + LANES - 1) // LANES * LANES)
 
 
 @njit
