@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from bcrl.common.compiling import kept
-from bcrl.q.forest.split import U, key_of, uncounted
+from bcrl.q.forest.split import U, inlined, key_of, uncounted
 
 #: So many rows, and one more for SHARE nodes of a tree, are sorted faster than walked.
 TOGETHER, SHARE = 32, 50
@@ -43,31 +43,44 @@ def new_descent(x):
     return Descent(keys, d, one, other, stack)
 
 
+@inlined
+def planes(descent, depth):
+    """The plane that a node of this depth has its rows in, and its children's."""
+    if depth & 1:
+        return descent.other, descent.one
+    return descent.one, descent.other
+
+
+@inlined
+def sort_node(descent, depth, start, stop, feature, cut):
+    """Sort a node's rows into its children's plane; returns the left child's end."""
+    keys, width, column = descent.keys, U(descent.d), U(feature)
+    here, there = planes(descent, depth)
+    left, right = start, stop - U(1)
+    for i in range(start, stop):
+        row = here[i]
+        goes_left = U(keys[U(row) * width + column] <= cut)
+        there[left], there[right] = row, row  # the next row corrects one
+        left += goes_left
+        right -= U(1) - goes_left
+    return left
+
+
 @uncounted
 def _sort_down(nodes, values, root, descent, begin, end, total):
-    """Add one tree's predictions to `total`, sorting the rows begin:end down it.
-
-    A node's rows lie in one plane and are sorted into the other by its cut.
-    """
-    keys, d, one, other, stack = descent
-    width, node, depth, top = U(d), root, 0, 0
+    """Add one tree's predictions to `total`, sorting the rows begin:end down it."""
+    stack, node, depth, top = descent.stack, root, 0, 0
     start, stop = U(begin), U(end)
     for i in range(start, stop):
-        one[i] = np.uint32(i)
+        descent.one[i] = np.uint32(i)
     while True:
         child, feature, cut = nodes[node].child, nodes[node].feature, nodes[node].cut
-        here, there = (other, one) if depth & 1 else (one, other)
         if feature < 0:
+            here, _ = planes(descent, depth)
             for i in range(start, stop):
                 total[here[i]] += values[child]
         else:
-            left, right, column = start, stop - U(1), U(feature)
-            for i in range(start, stop):
-                row = here[i]
-                goes_left = U(keys[U(row) * width + column] <= cut)
-                there[left], there[right] = row, row  # the next row corrects one
-                left += goes_left
-                right -= U(1) - goes_left
+            left = sort_node(descent, depth, start, stop, feature, cut)
             depth += 1
             if left < stop:
                 stack[top, 0], stack[top, 1] = child + 1, depth

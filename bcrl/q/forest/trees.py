@@ -1,4 +1,4 @@
-"""Compiled extra-trees: growing a forest, and moving rows down a grown one.
+"""Compiled extra-trees: growing a forest.
 
 Buffers keep the rows of a node side by side. They hold three *planes*: the rows as
 given, and two that the levels of a tree use in turn. A split moves a node's rows from
@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from bcrl.common.compiling import kept
-from bcrl.q.forest.descent import add_trees, new_descent
+from bcrl.q.forest.descent import new_descent, planes, sort_node
 from bcrl.q.forest.lanes import LANES, choose_all, load, new_sums, store
 from bcrl.q.forest.split import (
     NODE,
@@ -103,12 +103,14 @@ def _move_rows(rows, n, width, depth, start, stop, feature, cut):
 
 
 @uncounted
-def _grow_tree(rows, width, whole, settings, state, work, fitted, tree, at):
-    """Grow one tree depth first and add its predictions to `fitted`.
+def _grow_tree(
+    rows, queries, width, whole, settings, state, work, fitted, queried, tree, at, keep
+):
+    """Grow one tree depth first and add its predictions to `fitted` and `queried`.
 
     whole: weight of all rows, their sum of targets, and the target of fixed-point 1;
     work: a permutation of the features, sums and a stack; tree: nodes and values,
-    filled from `at` on. Returns the new `at` and the tree's depth.
+    filled from `at` on if `keep`. Returns the new `at` and the tree's depth.
     """
     min_split, min_leaf, max_features, max_depth = settings
     node_weight, node_total, unit = whole
@@ -119,8 +121,10 @@ def _grow_tree(rows, width, whole, settings, state, work, fitted, tree, at):
     n_nodes, n_values = at
     node, depth, deepest, top = n_nodes, 0, 0, 0
     n_nodes += 1
-    n = U(fitted.size)
-    start, stop = U(0), n
+    n, m = U(fitted.size), U(queried.size)
+    start, stop, q_start, q_stop = U(0), n, U(0), m
+    for i in range(m):
+        queries.one[i] = np.uint32(i)
     while True:
         here = _plane(depth) * n
         first, last = here + start, here + stop
@@ -162,9 +166,13 @@ def _grow_tree(rows, width, whole, settings, state, work, fitted, tree, at):
             value = node_total * unit / node_weight
             for i in range(first, last):
                 fitted[rows.origin[i]] += value
-            nodes[node].cut, nodes[node].feature = 0, -1
-            nodes[node].child = n_values
-            values[n_values] = value
+            there, _ = planes(queries, depth)
+            for i in range(q_start, q_stop):
+                queried[there[i]] += value
+            if keep:
+                nodes[node].cut, nodes[node].feature = 0, -1
+                nodes[node].child = n_values
+                values[n_values] = value
             n_values += 1
             deepest = max(deepest, depth)
             if top == 0:
@@ -172,20 +180,26 @@ def _grow_tree(rows, width, whole, settings, state, work, fitted, tree, at):
             top -= 1
             node, depth = stack[top, 0], stack[top, 1]
             start, stop = U(stack[top, 2]), U(stack[top, 3])
-            node_weight, node_total = stack[top, 4], stack[top, 5]
+            q_start, q_stop = U(stack[top, 4]), U(stack[top, 5])
+            node_weight, node_total = stack[top, 6], stack[top, 7]
             continue
         middle = _move_rows(rows, n, width, depth, start, stop, feature, cut)
-        nodes[node].cut, nodes[node].feature = cut, feature
-        nodes[node].child = n_nodes
+        q_middle = q_start
+        if q_start < q_stop:
+            q_middle = sort_node(queries, depth, q_start, q_stop, feature, cut)
+        if keep:
+            nodes[node].cut, nodes[node].feature = cut, feature
+            nodes[node].child = n_nodes
         node = n_nodes
         n_nodes += 2
         depth += 1
         # The right child waits, the left one is next.
         stack[top, 0], stack[top, 1] = node + 1, depth
         stack[top, 2], stack[top, 3] = middle, stop
-        stack[top, 4], stack[top, 5] = node_weight - w_left, node_total - s_left
+        stack[top, 4], stack[top, 5] = q_middle, q_stop
+        stack[top, 6], stack[top, 7] = node_weight - w_left, node_total - s_left
         top += 1
-        stop, node_weight, node_total = middle, w_left, s_left
+        stop, q_stop, node_weight, node_total = middle, q_middle, w_left, s_left
 
 
 @kept(nogil=True)
@@ -209,20 +223,16 @@ def grow_forest(x, y, multiplicity, seeds, queries, settings, keep):
         rows.target[i] = np.int64(np.rint(y[i] * 2.0**bits))
         total += rows.target[i] * (multiplicity[i] if weighted else 1)
     fitted, queried = np.zeros(n), np.zeros(queries.shape[0])
-    work = np.arange(d), new_sums(width), np.empty((n + 1, 6), np.int64)
+    work = np.arange(d), new_sums(width), np.empty((n + 1, 8), np.int64)
     descent = new_descent(queries)
     first, depths = np.zeros(trees + 1, np.int64), np.empty(trees, np.int64)
-    room = trees * n if keep else n  # leaves that there can be; unused memory is free
+    room = trees * n if keep else 0  # leaves that there can be; unused memory is free
     tree = np.empty(2 * room, NODE), np.empty(room, np.float64)
     whole, leaves = (weight, total, 2.0**-bits), 0
     for t in range(trees):
-        buffers = rows, width, whole, settings, seeds[t], work
-        at, depths[t] = _grow_tree(*buffers, fitted, tree, (first[t], leaves))
-        first[t + 1], grown = at
-        add_trees(*tree, first, t, t + 1, descent, queried)
-        if keep:
-            leaves = grown
-        else:  # the next tree takes the place of this one
-            first[t + 1] = 0
+        buffers = rows, descent, width, whole, settings, seeds[t], work
+        at = first[t], leaves
+        at, depths[t] = _grow_tree(*buffers, fitted, queried, tree, at, keep)
+        first[t + 1], leaves = at
     nodes, values = tree[0][: first[trees]].copy(), tree[1][:leaves].copy()
     return nodes, values, first, depths, fitted / trees, queried / trees
