@@ -1,22 +1,27 @@
 """Compiled prediction: rows go down the trees of a grown forest.
 
-Many rows are sorted down a tree together; few rows walk down side by side, a level at a
-time, so that the processor overlaps their reads. Neither way branches on a row's side,
-and both add a row's values in the order of the trees: they give the same bytes.
+Many rows are sorted down a tree together; few rows walk down some trees side by side, a
+level at a time, so that the processor overlaps their reads. Neither way branches on a
+row's side, and both add a row's values in the order of the trees: the same bytes.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import carray, njit, types
+from numba.core.cgutils import get_or_insert_function
 from numpy.typing import NDArray
 
 from bcrl.common.compiling import kept
-from bcrl.q.forest.split import U, inlined, key_of, uncounted
+from bcrl.q.forest.lanes import instructions
+from bcrl.q.forest.split import LOW32, NODE, U, inlined, key_of, uncounted
 
 #: So many rows, and one more for SHARE nodes of a tree, are sorted faster than walked.
 TOGETHER, SHARE = 32, 50
-SIDE_BY_SIDE = U(16)  # rows that walk down a tree together
+WALKERS = 128  # at least so many, if there are enough trees, hide that memory is slow
+LINE, AHEAD = 5, 4096  # nodes in a cache line; nodes that are read ahead: 48 KiB
+HIGH = U(32)  # where a walker's number begins in its word
 CACHED = 2**19  # keys of the rows that are sorted together: 2 MiB
 
 
@@ -26,7 +31,7 @@ class Descent(NamedTuple):
     keys: NDArray[np.int32]  # (m · d,)
     d: int
     one: NDArray[np.uint32]  # (m,) each: the rows, sorted from one into the other
-    other: NDArray[np.uint32]  # and back; or the nodes that rows have walked to
+    other: NDArray[np.uint32]  # and back
     stack: NDArray[np.int64]
 
 
@@ -96,57 +101,91 @@ def _sort_down(nodes, values, root, descent, begin, end, total):
         start, stop = U(stack[top, 2]), U(stack[top, 3])
 
 
-@uncounted
-def _walk_down(nodes, values, root, descent, total):
-    """Add one tree's predictions to `total`, a few rows at a time, level by level."""
-    keys, width, at, m = descent.keys, U(descent.d), descent.one, U(total.size)
-    for begin in range(U(0), m, SIDE_BY_SIDE):
-        end = min(m, begin + SIDE_BY_SIDE)
-        for i in range(begin, end):
-            at[i] = np.uint32(root)
-        walking = True
-        while walking:
-            walking = False
-            for i in range(begin, end):
-                node = nodes[U(at[i])]
-                inner = node.feature >= 0
-                right = keys[i * width + U(max(node.feature, 0))] > node.cut
-                at[i] = np.uint32(node.child + right) if inner else at[i]
-                walking |= inner
-        for i in range(begin, end):
-            total[i] += values[nodes[U(at[i])].child]
+@instructions
+def prefetch(typing, array, i):
+    """Begin to read array[i], so that its use in a moment does not wait."""
+
+    def generate(context, b, signature, args):
+        byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag])
+        function = get_or_insert_function(b.module, kind, "llvm.prefetch.p0i8")
+        data = context.make_array(signature.args[0])(context, b, args[0]).data
+        place = b.bitcast(b.gep(data, [args[1]]), byte)
+        b.call(function, [place, flag(0), flag(3), flag(1)])  # a read, of data in use
+
+    return types.void(array, types.uint64), generate
+
+
+@instructions
+def pointer(typing, address):
+    """The pointer to an integer address."""
+
+    def generate(context, b, signature, args):
+        return b.inttoptr(args[0], ir.IntType(8).as_pointer())
+
+    return types.voidptr(types.int64), generate
 
 
 @njit
-def add_trees(nodes, values, first, start, stop, descent, total):
-    """Add the predictions of trees start:stop to `total` (m,), in their order."""
-    m, size = total.size, (first[stop] - first[start]) // (stop - start)
-    if m >= TOGETHER + size // SHARE:
-        part = max(1, CACHED // descent.d)
-        for begin in range(0, m, part):
-            for t in range(start, stop):
-                end = min(m, begin + part)
-                _sort_down(nodes, values, first[t], descent, begin, end, total)
-    else:
-        for t in range(start, stop):
-            _walk_down(nodes, values, first[t], descent, total)
+def _walk_down(nodes, values, first, descent, total):
+    """Add all trees to `total`, the rows of some trees at a time, level by level.
+
+    A walker is a row in a tree: a word of its number and of the node that it is at.
+    """
+    keys, width, m, trees = descent.keys, U(descent.d), U(total.size), first.size - 1
+    some = max(1, WALKERS // total.size)
+    walkers, column = np.empty((2, some * total.size), np.uint64)
+    leaf = np.empty(some * total.size, np.int32)
+    for begin in range(0, trees, some):
+        end, left = min(begin + some, trees), U(0)
+        for t in range(begin, end):
+            for i in range(m):
+                walkers[left], column[left] = (left << HIGH) | U(first[t]), i * width
+                left += U(1)
+        ahead = min(first[min(end + some, trees)], first[end] + AHEAD)
+        for at in range(first[end], ahead, LINE):  # the next trees, if they are small
+            prefetch(nodes, U(at))
+        while left > U(0):
+            walking = U(0)
+            for j in range(left):
+                who, at = walkers[j] >> HIGH, walkers[j] & LOW32
+                cut, feature, child = nodes[at].cut, nodes[at].feature, nodes[at].child
+                leaf[who] = child
+                right = keys[column[who] + U(max(feature, np.int32(0)))] > cut
+                after = U(child) + U(right)
+                prefetch(nodes, after)
+                walkers[walking] = (who << HIGH) | after
+                walking += U(feature >= 0)  # the next one replaces a walker at its leaf
+            left = walking
+        for t in range(U(end - begin)):
+            for i in range(m):
+                total[i] += values[U(leaf[t * m + i])]
 
 
 @kept(nogil=True)
-def predict_forest(nodes, values, first, x):
-    """Mean over the trees at x (m, d) float32, as float64 (m,)."""
-    trees, total = first.size - 1, np.zeros(x.shape[0])
-    add_trees(nodes, values, first, 0, trees, new_descent(x), total)
-    return total / trees
+def predict_forests(table):
+    """The means (m,) float64 over the trees of each forest at its own points (m, d).
 
-
-@kept(nogil=True)
-def predict_stack(nodes, values, first, trees, x, begins):
-    """Means over trees[k]:trees[k+1] at the rows begins[k]:begins[k+1] of x (m, d)."""
-    total = np.zeros(x.shape[0])
-    for k in range(trees.size - 1):
-        rows, start, stop = x[begins[k] : begins[k + 1]], trees[k], trees[k + 1]
-        own = total[begins[k] : begins[k + 1]]
-        add_trees(nodes, values, first, start, stop, new_descent(rows), own)
-        own /= stop - start
-    return total
+    table (F, 7) int64: the addresses of a forest's nodes, values, first nodes and
+    points (float32), the number of its trees, m and d. Compiled code takes no list of
+    arrays without a copy, but it takes their addresses.
+    """
+    found = []
+    for row in table:
+        trees, m, d = row[4], row[5], row[6]
+        first = carray(pointer(row[2]), (trees + 1,), np.int64)
+        size = first[trees]
+        nodes = carray(pointer(row[0]), (size,), NODE)
+        values = carray(pointer(row[1]), ((size + trees) // 2,), np.float64)
+        total = np.zeros(m)
+        descent = new_descent(carray(pointer(row[3]), (m, d), np.float32))
+        if m >= TOGETHER + size // trees // SHARE:
+            part = max(1, CACHED // d)
+            for begin in range(0, m, part):
+                for t in range(trees):
+                    end = min(m, begin + part)
+                    _sort_down(nodes, values, first[t], descent, begin, end, total)
+        elif m > 0:
+            _walk_down(nodes, values, first, descent, total)
+        found.append(total / trees)
+    return found

@@ -8,6 +8,7 @@ are predicted while the trees grow; many forests are fitted in one call, on thre
 Targets are rounded to multiples of about max|y| · rows · 2^−62; sums are then exact.
 """
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +19,7 @@ from itertools import pairwise
 import numpy as np
 
 from bcrl.errors import BcrlError, at_least
-from bcrl.q.forest.descent import predict_forest, predict_stack
+from bcrl.q.forest import descent
 from bcrl.q.forest.trees import grow_forest
 
 _pool = cache(ThreadPoolExecutor)  # starting threads costs more than a small call
@@ -81,8 +82,7 @@ class Forest:
 
     def predict(self, x: np.ndarray) -> np.ndarray:
         """Mean of the trees at `x`, (n, d) taken as float32: (n,) float64."""
-        x = _points("x", x, self.n_features)
-        return predict_forest(self.nodes, self.values, self.first, x)
+        return predict_forests([self], [x])[0]
 
 
 @dataclass
@@ -106,33 +106,6 @@ def join(forests: Sequence[Forest]) -> Forest:
     values = np.concatenate([forest.values for forest in forests])
     depths = np.concatenate([forest.depths for forest in forests])
     return Forest(nodes, values, np.concatenate(first), depths, forests[0].n_features)
-
-
-@dataclass(frozen=True)
-class Stack:
-    """Many forests that predict in one compiled call, each at its own points."""
-
-    joint: Forest  # the trees of all
-    trees: np.ndarray  # (F+1,) int64, where each forest's trees begin
-
-    @classmethod
-    def of(cls, forests: Sequence[Forest]) -> "Stack":
-        """The stack of `forests`, at least one, of equally many features."""
-        trees = np.cumsum([0, *(len(forest.depths) for forest in forests)])
-        return cls(join(forests), trees)
-
-    def predict(self, x: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """The predictions (n,) of each forest at its own x (n, d), bit for bit."""
-        begins = np.cumsum([0, *map(len, x)])
-        if len(begins) != len(self.trees):
-            raise BcrlError(
-                f"{len(x)} sets of points for {len(self.trees) - 1} forests"
-            )
-        joint, points = self.joint, np.concatenate(x, dtype=np.float32)
-        points = _points("x", points, joint.n_features)
-        tree = joint.nodes, joint.values, joint.first
-        total = predict_stack(*tree, self.trees, points, begins)
-        return np.split(total, begins[1:-1])
 
 
 def importances(
@@ -196,15 +169,29 @@ def predict_forests(
     forests: Sequence[Forest], x: Sequence[np.ndarray], *, threads: int = 1
 ) -> list[np.ndarray]:
     """The predictions (n,) float64 of each forest at its own x (n, d)."""
-    pairs = list(zip(forests, x, strict=True))
-    return _spread(lambda pair: pair[0].predict(pair[1]), pairs, threads)
+    at_least("threads", threads, 1)
+    table, points = [], []
+    for forest, given in zip(forests, x, strict=True):
+        own = _points("x", given, forest.n_features)
+        arrays = (forest.nodes, forest.values, forest.first, own)
+        places = (array.ctypes.data for array in arrays)
+        table.append((*places, len(forest.depths), *own.shape))
+        points.append(own)  # whose memory must last
+    share = max(1, math.ceil(len(table) / threads))
+    parts = [table[i : i + share] for i in range(0, len(table), share)]
+    found = _spread(
+        lambda part: descent.predict_forests(np.array(part)), parts, threads
+    )
+    return [means for part in found for means in part]
 
 
 def _spread(function: Callable, items: Sequence, threads: int) -> list:
     """The results of `function` for all items, on up to `threads` threads."""
     at_least("threads", threads, 1)
-    threads = min(threads, len(items), 4 * (os.cpu_count() or 1))
-    return list((_pool(threads).map if threads > 1 else map)(function, items))
+    threads = min(threads, len(items))
+    if threads <= 1:
+        return list(map(function, items))
+    return list(_pool(min(threads, 4 * (os.cpu_count() or 1))).map(function, items))
 
 
 def _points(name: str, x: np.ndarray, d: int | None = None) -> np.ndarray:
