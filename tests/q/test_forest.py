@@ -13,7 +13,6 @@ from bcrl.q.forest import descent, lanes, split, trees
 from bcrl.q.forest.estimator import ExtraTrees
 from bcrl.q.forest.forest import (
     Regression,
-    Stack,
     TreeSettings,
     fit_forests,
     predict_forests,
@@ -210,11 +209,13 @@ def test_neither_threads_nor_other_forests_nor_keeping_change_a_forest():
     forests, points = [fit.forest for fit in alone], [task.x for task in tasks]
     for threads in (1, 4):
         found = predict_forests(forests, points, threads=threads)
-        found += Stack.of(forests).predict(points)
-        for got, one in zip(found, alone * 2, strict=True):
+        for got, one in zip(found, alone, strict=True):
             assert (got == one.fitted).all()
-    with pytest.raises(BcrlError, match="6 forests"):
-        Stack.of(forests).predict(points[1:])
+    assert predict_forests([], []) == []
+    for few in (0, 1, 20, 200):  # the rows of all forests walk
+        found = predict_forests(forests, [x[:few] for x in points])
+        for got, one in zip(found, alone, strict=True):
+            assert (got == one.fitted[:few]).all()
 
 
 @pytest.mark.parametrize("scale", [1e-290, 1e-9, 1.0, 1e12, 1e300])

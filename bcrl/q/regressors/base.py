@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bcrl.common.seeding import stream
 from bcrl.common.serialization import DERIVED, storable
 from bcrl.errors import BcrlError, ConfigError, LostSeeds
-from bcrl.q.functions import Values
+from bcrl.q.functions import Values, each
 
 
 @storable
@@ -133,6 +133,9 @@ def _reason(regressor: Regressor, what: str, error: Exception) -> str:
     return f"algorithm.regressor={name}: {what} failed: {text}"
 
 
+FEW = 1000  # states; more take much memory, since each model has its own copy
+
+
 @storable
 @dataclass(frozen=True)
 class FittedQ:
@@ -149,12 +152,13 @@ class FittedQ:
     def together(
         terms: "Sequence[FittedQ]", states: Sequence[NDArray], n_actions: int
     ) -> list[Values]:
-        """The values of each term, all predicted in one call if the regressor is one.
+        """The values of each term; at few states all are predicted in one call.
 
-        A boosted Q is a sum of many terms, and an episode's step asks for few states.
+        A boosted Q is a sum of many terms, and an episode's step queries few states.
         """
         regressor, threads = terms[0].regressor, terms[0].team.threads
-        if any(term.regressor != regressor for term in terms):
+        mixed = any(term.regressor != regressor for term in terms)
+        if len(terms) > 1 and (mixed or sum(map(len, states)) > FEW):
             return [term(states, n_actions) for term in terms]
         every = [fitted for term in terms for row in term.models for fitted in row]
         lost = [fitted for fitted in every if fitted and fitted.model is None]
@@ -163,7 +167,7 @@ class FittedQ:
             fits = regressor.fit(problems, True, threads)
             for fitted, fit in zip(lost, fits, strict=True):
                 fitted.model = fit.model
-        models = {
+        models: dict[Cell, Any] = {
             (s, a, k): fitted.model
             for k, term in enumerate(terms)
             for s, row in enumerate(term.models)
@@ -185,5 +189,4 @@ class FittedQ:
         out = [[np.zeros((len(x), n_actions)) for x in states] for _ in terms]
         for (s, a, k), values in found.items():
             out[k][s][:, a] = values
-        stacked = isinstance(states, np.ndarray)
-        return [np.stack(own) for own in out] if stacked else out
+        return [each(states, own.__getitem__) for own in out]
