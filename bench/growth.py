@@ -4,8 +4,8 @@ First with the residual's number: on one dataset of the hill a stage learns its 
 residual, on nothing, or its 40th, on a frozen base of 39. The base's values at the
 points are computed once a stage and printed apart. Second acting: the values of 1 and
 of 10 residuals at 20 states, as an episode's step queries them. Third with the episodes
-of the dataset and with the number of seeds in lockstep. An iteration is targets, fits and
-values at all points; evaluation is not in it. All by turns, CPU time, the least of
+of the dataset and with the number of seeds in lockstep. An iteration is targets, fits
+and values at all points; evaluation is not in it. All by turns, CPU time, the least of
 several iterations after early ones, whose targets take few values and give small trees.
 """
 

@@ -157,7 +157,7 @@ class FittedQ:
         A boosted Q is a sum of many terms, and an episode's step queries few states.
         """
         regressor, threads = terms[0].regressor, terms[0].team.threads
-        mixed = any(term.regressor != regressor for term in terms)
+        mixed = any(term.regressor is not regressor for term in terms)
         if len(terms) > 1 and (mixed or sum(map(len, states)) > FEW):
             return [term(states, n_actions) for term in terms]
         every = [fitted for term in terms for row in term.models for fitted in row]
