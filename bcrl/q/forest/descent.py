@@ -163,7 +163,7 @@ def _walk_down(nodes, values, first, descent, total):
 
 
 @kept(nogil=True)
-def predict_forests(table):
+def predict_addressed(table):
     """The means (m,) float64 over the trees of each forest at its own points (m, d).
 
     table (F, 7) int64: the addresses of a forest's nodes, values, first nodes and

@@ -180,7 +180,7 @@ def predict_forests(
     share = max(1, math.ceil(len(table) / threads))
     parts = [table[i : i + share] for i in range(0, len(table), share)]
     found = _spread(
-        lambda part: descent.predict_forests(np.array(part)), parts, threads
+        lambda part: descent.predict_addressed(np.array(part)), parts, threads
     )
     return [means for part in found for means in part]
 
