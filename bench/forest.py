@@ -1,15 +1,19 @@
 """Times of the forest engine against scikit-learn's, one core: python bench/forest.py
 
-Hill size: 29 000 rows of (position, velocity), 58 000 query rows (each successor under
-two actions' forests), 50 trees. Maze: an iteration of 100 000 transitions, one forest
-of 50 trees for each of 4 actions, at most 441 distinct rows in each, 441 query rows.
-The maze stands in two lines: scikit-learn has no multiplicities, so that it fits all
-rows in both; its user may predict at the 441 distinct successors only, as we do, or
-at all 100 000 as they come.
+First 10³, 10⁴ and 10⁵ rows (--million: 10⁶ too) of 1 to 32 features, as many queries
+and 10 trees, with the paper's settings and scikit-learn's defaults. Then the paper's
+two environments with 50 trees. Hill: 29 000 rows of (position, velocity), 58 000 query
+rows (each successor under two actions' forests). Maze: an iteration of 100 000
+transitions, one forest for each of 4 actions, at most 441 distinct rows in each, 441
+query rows. The maze stands in two lines: scikit-learn has no multiplicities, so that it
+fits all rows in both; its user may predict at the 441 distinct successors only, as we
+do, or at all 100 000 as they come.
 Both sides are timed by turns and equally often, CPU time, the least of several.
 """
 
 from __future__ import annotations
+
+import sys
 
 import numpy as np
 from sklearn.ensemble import ExtraTreesRegressor
@@ -22,9 +26,9 @@ TREES = 50
 PAPER = TreeSettings(min_samples_split=5, min_samples_leaf=2)
 
 
-def judge() -> ExtraTreesRegressor:
+def judge(trees: int = TREES) -> ExtraTreesRegressor:
     return ExtraTreesRegressor(
-        TREES, min_samples_split=5, min_samples_leaf=2, n_jobs=1, random_state=0
+        trees, min_samples_split=5, min_samples_leaf=2, n_jobs=1, random_state=0
     )
 
 
@@ -42,7 +46,32 @@ def hill(n: int, key: int) -> tuple[np.ndarray, np.ndarray]:
     return x, y + rng.normal(0, 0.02, n)
 
 
-def main() -> None:
+def features(n: int, d: int) -> None:
+    """Print how many times as fast as scikit-learn we fit and predict, two settings."""
+    rng = np.random.default_rng([n, d])
+    x, queries = rng.uniform(-1, 1, (2, n, d)).astype(np.float32)
+    y = np.sin(4 * x[:, 0]) + (x[:, -1] > 0.2) * x[:, d // 2] + rng.normal(0, 0.2, n)
+    print(f"{n:9} rows, {d:2} features", end="")
+    for settings in (PAPER, TreeSettings()):
+        model = judge(trees := 10).set_params(
+            min_samples_split=settings.min_samples_split,
+            min_samples_leaf=settings.min_samples_leaf,
+        )
+        task = Regression(x, y, seeds()[:trees])
+        forest = fit_forests([task], settings)[0].forest
+        model.fit(x, y)
+        calls = [
+            lambda model=model: model.fit(x, y),
+            lambda model=model: model.predict(queries),
+            lambda task=task, given=settings: fit_forests([task], given),
+            lambda forest=forest: forest.predict(queries),
+        ]
+        fit, predict, ours, ours_predict = by_turns(calls, turns=3)
+        print(f"{fit / ours:9.1f}×{predict / ours_predict:9.1f}×", end="", flush=True)
+    print()
+
+
+def paper() -> None:
     x, y = hill(29_000, 0)
     queries, _ = hill(58_000, 1)
     model, task = judge(), Regression(x, y, seeds())
@@ -101,6 +130,16 @@ def main() -> None:
     ):
         times = f"{theirs / TREES * 1e3:11.3f} ms{mine / TREES * 1e3:9.4f} ms"
         print(f"{name:38}{times}{theirs / mine:7.1f}×")
+
+
+def main() -> None:
+    print(
+        "times as fast as scikit-learn    paper: fit   predict  defaults: fit predict"
+    )
+    for n in (10**3, 10**4, 10**5, *([10**6] if "--million" in sys.argv else [])):
+        for d in (1, 2, 4, 8, 16, 32):
+            features(n, d)
+    paper()
 
 
 if __name__ == "__main__":

@@ -2,9 +2,10 @@
 
 First with the residual's number: on one dataset of the hill a stage learns its first
 residual, on nothing, or its 40th, on a frozen base of 39. The base's values at the
-points are computed once a stage and printed apart. Then with the episodes of the
-dataset and with the number of seeds in lockstep. An iteration is targets, fits and
-values at all points; evaluation is not in it. All by turns, CPU time, the least of
+points are computed once a stage and printed apart. Second acting: the values of 1 and
+of 10 residuals at 20 states, as an episode's step queries them. Third with the episodes
+of the dataset and with the number of seeds in lockstep. An iteration is targets, fits
+and values at all points; evaluation is not in it. All by turns, CPU time, the least of
 several iterations after early ones, whose targets take few values and give small trees.
 """
 
@@ -16,6 +17,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+import timing
 from threadpoolctl import threadpool_limits
 
 from bcrl.envs.car_on_hill import CarOnHill
@@ -93,8 +95,19 @@ def residuals() -> None:
     print(f"once per stage: base at {points} points, {base.seconds * 1e3:.0f} ms")
 
 
+def acting() -> None:
+    """Print the time of all actions' values at 20 states, 1 and 10 residuals."""
+    learned = [now.result.residual for now in itertools.islice(iterations(250), 20)]
+    states = np.random.default_rng(0).uniform([-1, -3], [1, 3], (100, 1, 20, 2))
+    sums = [Sum(tuple(learned[-n:])) for n in (1, 10)]
+    calls = [lambda q=q: [q(x, ENV.n_actions) for x in states] for q in sums]
+    one, ten = (took / len(states) * 1e6 for took in timing.by_turns(calls, TURNS))
+    print(f"acting at 20 states: {one:.0f} µs, 10 residuals {ten:.0f} µs")
+
+
 def main() -> None:
     residuals()
+    acting()
     sizes = [(250, 1), (500, 1), (1000, 1), (250, 2), (250, 4)]
     times = by_turns([iterations(*size) for size in sizes])
     print(f"\n{'episodes':>9}{'seeds':>7}{'ms per iteration':>17}{'nodes/tree':>12}")

@@ -82,6 +82,17 @@ class Zero:
 ZERO = Zero()
 
 
+def together(
+    terms: Sequence[Q], states: Sequence[NDArray[np.float64]], n_actions: int
+) -> list[Values]:
+    """The values of each term, by the terms' own `together` if they are of one type."""
+    kinds = {type(term) for term in terms}
+    joint = getattr(kinds.pop(), "together", None) if len(kinds) == 1 else None
+    if joint is not None:
+        return joint(terms, states, n_actions)
+    return [term(states, n_actions) for term in terms]
+
+
 @storable
 @dataclass(frozen=True)
 class Sum:
@@ -90,7 +101,7 @@ class Sum:
     terms: tuple[Q, ...]
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        values = [term(states, n_actions) for term in self.terms]
+        values = together(self.terms, states, n_actions)
         if isinstance(states, np.ndarray):
             return reduce(np.add, values)
         return [reduce(np.add, own) for own in zip(*values, strict=True)]

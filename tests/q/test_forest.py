@@ -9,9 +9,14 @@ from sklearn.ensemble import ExtraTreesRegressor
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from bcrl.errors import BcrlError, ConfigError
+from bcrl.q.forest import descent, lanes, split, trees
 from bcrl.q.forest.estimator import ExtraTrees
-from bcrl.q.forest.forest import Regression, TreeSettings, fit_forests, predict_forests
-from bcrl.q.forest.trees import TOGETHER
+from bcrl.q.forest.forest import (
+    Regression,
+    TreeSettings,
+    fit_forests,
+    predict_forests,
+)
 
 PAPER = TreeSettings(min_samples_split=5, min_samples_leaf=2)
 SEEDS = 200  # forests per side of a comparison
@@ -40,9 +45,11 @@ def problem(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.nd
     elif name == "ties":
         x, points = grid[(grid < 4).all(1)] / 4, rng.uniform(0, 0.75, (12, 2))
         y = (np.arange(16) % 5 == 0).astype(float)
-    else:  # four features, one of them constant, one with few values
-        x, points = rng.normal(size=(120, 4)), rng.normal(size=(12, 4))
+    else:  # one feature is constant, one has few values, two may be equal
+        d = int(name.split()[0])
+        x, points = rng.normal(size=(120, d)), rng.normal(size=(12, d))
         x[:, 1], x[:, 2] = 0.25, np.round(x[:, 2])
+        x[:, d // 2 :: 5] = x[:, [d // 2]]
         y, counts = x[:, 0] * x[:, 2] + x[:, 3], rng.integers(1, 4, 120)
     return x.astype(np.float32), dyadic(y), counts, points.astype(np.float32)
 
@@ -77,10 +84,12 @@ COMPARED = [
     ("lattice", PAPER),
     ("lattice", TreeSettings(9, 4)),
     ("ties", TreeSettings(2, 1)),
-    ("features", PAPER),
-    ("features", TreeSettings(4, 1, max_features=1)),
-    ("features", TreeSettings(2, 2, max_features=2)),
-    ("features", TreeSettings(max_depth=2)),
+    ("4 features", PAPER),
+    ("4 features", TreeSettings(4, 1, max_features=1)),
+    ("4 features", TreeSettings(2, 2, max_features=2)),
+    ("4 features", TreeSettings(max_depth=2)),
+    ("8 features", PAPER),
+    ("16 features", TreeSettings(2, 1)),
     ("continuous", TreeSettings(max_depth=5)),
 ]
 
@@ -114,7 +123,7 @@ def test_the_comparison_notices_a_wrong_setting():
     assert min(p_values(theirs, wrong)) < 1e-9
 
 
-@pytest.mark.parametrize("name", ["lattice", "features"])
+@pytest.mark.parametrize("name", ["lattice", "4 features"])
 @pytest.mark.parametrize("most", [None, 1])
 def test_multiplicities_are_repeated_rows_bit_for_bit(name, most):
     x, y, counts, points = problem(name)
@@ -134,24 +143,53 @@ def test_multiplicities_are_repeated_rows_bit_for_bit(name, most):
     assert memory <= 16.2 * len(one.forest.nodes)  # bytes
 
 
+@pytest.mark.parametrize("d", [3, 4, 7, 33])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_splits_by_vectors_are_the_scalar_references_bit_for_bit(d, weighted):
+    rng = np.random.default_rng(d)
+    for n in (2, 9, 300):
+        x = rng.normal(size=(n, d)).astype(np.float32)
+        x[:, : d // 2] = np.round(x[:, : d // 2])  # ties, and some constant features
+        rows = trees._new_rows(x, weighted)
+        rows.target[:n] = y = rng.integers(-9, 9, n)
+        counts = rng.integers(1, 4, n) if weighted else np.ones(n, np.int64)
+        rows.weight[:n] = counts[: rows.weight.size]
+        node = split.U(0), split.U(n), counts.sum(), counts @ y
+        width = split.U(trees._width(d))
+        orders = np.arange(d), np.arange(d)
+        for state in map(split.U, range(20)):
+            one = split.choose(rows, width, *node, (2, d), state, orders[0])
+            sums = lanes.new_sums(width)
+            other = lanes.choose_all(rows, *node, 2, state, orders[1], sums)
+            assert one == other and (orders[0] == orders[1]).all()
+
+
 def hill(n: int, key: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(key)
     x = rng.uniform([-1, -3], [1, 3], (n, 2)).astype(np.float32)
     return x, np.sign(x[:, 1]) * 0.95 ** np.floor(9 * (1 - x[:, 0])) * (x[:, 0] > -0.5)
 
 
-@pytest.mark.parametrize("d", [1, 2, 3])
+@pytest.mark.parametrize("d", [1, 2, 3, 300])
 def test_predictions_while_growing_are_the_forests_bit_for_bit(d):
     rng = np.random.default_rng(d)
     x, queries = rng.normal(size=(900, d)), rng.normal(size=(2000, d))
     y = rng.normal(size=900)
-    assert len(queries) > TOGETHER
+    assert descent.CACHED // 300 < len(queries) < descent.CACHED // 3  # in two parts
     fit = fit_forests([Regression(x, y, seeds(7), None, queries)], PAPER)[0]
     assert (fit.forest.predict(x) == fit.fitted).all()
     assert (fit.forest.predict(queries) == fit.queried).all()
-    # Few rows are walked one by one, many are moved together.
-    few = [fit.forest.predict(part) for part in np.array_split(queries, 50)]
+    # Few rows are walked down the trees, many are sorted down.
+    few = [fit.forest.predict(part) for part in np.array_split(queries, 100)]
+    assert len(queries) / 100 < descent.TOGETHER < len(queries) / 3
     assert (np.concatenate(few) == fit.queried).all()
+
+
+def test_one_feature_has_the_trees_of_two_of_which_one_is_constant():
+    x, y = hill(500, 0)
+    tasks = [Regression(rows, y, seeds(5)) for rows in (x[:, :1], x * [1, 0])]
+    one, two = (fit.forest for fit in fit_forests(tasks, PAPER))
+    assert one.nodes.tobytes() == two.nodes.tobytes()
 
 
 def test_neither_threads_nor_other_forests_nor_keeping_change_a_forest():
@@ -173,6 +211,11 @@ def test_neither_threads_nor_other_forests_nor_keeping_change_a_forest():
         found = predict_forests(forests, points, threads=threads)
         for got, one in zip(found, alone, strict=True):
             assert (got == one.fitted).all()
+    assert predict_forests([], []) == []
+    for few in (0, 1, 20, 200):  # the rows of all forests walk
+        found = predict_forests(forests, [x[:few] for x in points])
+        for got, one in zip(found, alone, strict=True):
+            assert (got == one.fitted[:few]).all()
 
 
 @pytest.mark.parametrize("scale", [1e-290, 1e-9, 1.0, 1e12, 1e300])

@@ -1,10 +1,14 @@
-"""Shaped and memoized Q-functions query what they wrap only once."""
+"""Sums, shaped and memoized Q-functions."""
 
 import numpy as np
 import pytest
 
+from bcrl.learning.stage import SeedBatch
 from bcrl.learning.transfer import StageInit
-from bcrl.q.functions import ZERO, Shaped
+from bcrl.q.functions import ZERO, Shaped, Sum
+from bcrl.q.regressors import base
+from bcrl.q.regressors.ours import ForestRegressor
+from bcrl.q.regressors.scikit import Sklearn
 
 
 class Counting:
@@ -35,3 +39,27 @@ def test_a_memoized_q_is_the_same_q_queried_once_per_state(stacked):
         for x, values in zip(now, start.base(now, 2), strict=True):
             assert values.shape == (len(x), 2) and (values == x[:, :1] + 1).all()
     assert q.queried == 8  # four states of either seed
+
+
+@pytest.mark.parametrize("other", [ForestRegressor(trees=4), Sklearn("Ridge")])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_sum_has_the_values_of_its_terms_bit_for_bit(other, threads, monkeypatch):
+    rng, seeds, terms = np.random.default_rng(0), SeedBatch((3, 4), None, threads), []
+    for k, regressor in enumerate([ForestRegressor(trees=4), other, other]):
+        rows: list[list[base.Fitted | None]] = [[None, None], [None, None]]
+        for s, a in [(0, 0), (0, 1), (1, 0)]:  # seed 1 has never tried action 1
+            x = rng.random((90, 2)).astype(np.float32)
+            counts = np.ones(90, np.int64)
+            problem = base.Problem(x, rng.random(90), counts, x[:0], s, (k, a))
+            (fit,) = regressor.fit([problem], True, 1)
+            rows[s][a] = base.Fitted.of(problem, fit)
+        terms.append(base.FittedQ(rows, regressor, seeds))
+    q, states = Sum(tuple(terms)), [rng.random((7, 2)), rng.random((40, 2))]
+    for few in (base.FEW, 0):
+        monkeypatch.setattr(base, "FEW", few)
+        for s, found in enumerate(q(states, 2)):
+            one, two, three = (term(states, 2)[s] for term in terms)
+            assert found.shape == one.shape and (found == one + two + three).all()
+            model = terms[0].models[s][0].model
+            assert (model.predict(states[s]) == one[:, 0]).all()
+    assert (q(np.stack([states[0]] * 2), 2)[0] == q(states, 2)[0]).all()

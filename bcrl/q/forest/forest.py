@@ -8,6 +8,7 @@ are predicted while the trees grow; many forests are fitted in one call, on thre
 Targets are rounded to multiples of about max|y| · rows · 2^−62; sums are then exact.
 """
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +19,6 @@ from itertools import pairwise
 import numpy as np
 
 from bcrl.errors import BcrlError, at_least
-from bcrl.q.forest.trees import grow_forest, predict_forest
 
 _pool = cache(ThreadPoolExecutor)  # starting threads costs more than a small call
 
@@ -80,8 +80,7 @@ class Forest:
 
     def predict(self, x: np.ndarray) -> np.ndarray:
         """Mean of the trees at `x`, (n, d) taken as float32: (n,) float64."""
-        x = _points("x", x, self.n_features)
-        return predict_forest(self.nodes, self.values, self.first, x)
+        return predict_forests([self], [x])[0]
 
 
 @dataclass
@@ -152,6 +151,8 @@ def fit_forests(
 
     keep: whether the trees are stored; predictions come with each result either way.
     """
+    from bcrl.q.forest.trees import grow_forest  # which imports numba
+
     limits = tuple(2**62 if x is None else int(x) for x in astuple(settings))
 
     def fit(task: Regression) -> ForestFit:
@@ -168,15 +169,29 @@ def predict_forests(
     forests: Sequence[Forest], x: Sequence[np.ndarray], *, threads: int = 1
 ) -> list[np.ndarray]:
     """The predictions (n,) float64 of each forest at its own x (n, d)."""
-    pairs = list(zip(forests, x, strict=True))
-    return _spread(lambda pair: pair[0].predict(pair[1]), pairs, threads)
+    from bcrl.q.forest.descent import predict_addressed  # which imports numba
+
+    at_least("threads", threads, 1)
+    table, points = [], []
+    for forest, given in zip(forests, x, strict=True):
+        own = _points("x", given, forest.n_features)
+        arrays = (forest.nodes, forest.values, forest.first, own)
+        places = (array.ctypes.data for array in arrays)
+        table.append((*places, len(forest.depths), *own.shape))
+        points.append(own)  # whose memory must last
+    share = max(1, math.ceil(len(table) / threads))
+    parts = [table[i : i + share] for i in range(0, len(table), share)]
+    found = _spread(lambda part: predict_addressed(np.array(part)), parts, threads)
+    return [means for part in found for means in part]
 
 
 def _spread(function: Callable, items: Sequence, threads: int) -> list:
     """The results of `function` for all items, on up to `threads` threads."""
     at_least("threads", threads, 1)
-    threads = min(threads, len(items), 4 * (os.cpu_count() or 1))
-    return list((_pool(threads).map if threads > 1 else map)(function, items))
+    threads = min(threads, len(items))
+    if threads <= 1:
+        return list(map(function, items))
+    return list(_pool(min(threads, 4 * (os.cpu_count() or 1))).map(function, items))
 
 
 def _points(name: str, x: np.ndarray, d: int | None = None) -> np.ndarray:

@@ -96,7 +96,7 @@ def is_pure(rows, start, stop, total_weight, unit):
 
 
 @inlined
-def _gain(low, high, weight, total, node_weight, node_total, min_leaf):
+def gain(low, high, weight, total, node_weight, node_total, min_leaf):
     """Variance reduction of a split up to a factor of the node; −1 if not allowed.
 
     Mirrored splits give exactly the same number, so that ties are ties.
@@ -135,8 +135,8 @@ def choose_two(rows, first, last, node_weight, node_total, min_leaf, state):
         total0 += y & left0
         weight1 += w & left1
         total1 += y & left1
-    gain0 = _gain(low0, high0, weight0, total0, node_weight, node_total, min_leaf)
-    gain1 = _gain(low1, high1, weight1, total1, node_weight, node_total, min_leaf)
+    gain0 = gain(low0, high0, weight0, total0, node_weight, node_total, min_leaf)
+    gain1 = gain(low1, high1, weight1, total1, node_weight, node_total, min_leaf)
     second = gain1 > gain0
     if gain0 == gain1:
         state += GOLDEN
@@ -149,7 +149,7 @@ def choose_two(rows, first, last, node_weight, node_total, min_leaf, state):
 
 
 @uncounted
-def choose(rows, first, last, node_weight, node_total, limits, state, order):
+def choose(rows, width, first, last, node_weight, node_total, limits, state, order):
     """The best of the tried features by variance reduction, each cut at random.
 
     Features are visited in random order, so that ties between them fall either way. A
@@ -158,7 +158,7 @@ def choose(rows, first, last, node_weight, node_total, limits, state, order):
     targets; limits: (min_samples_leaf, max_features); order: a permutation of the
     features, which is shuffled further. Returns a Split and `state`.
     """
-    keys, target, weight, d = rows.keys, rows.target, rows.weight, U(order.size)
+    keys, target, weight = rows.keys, rows.target, rows.weight
     min_leaf, max_features = limits
     best, split = -1.0, Split(-1, np.int32(0), np.int64(0), np.int64(0))
     left, tried, constants = order.size, 0, 0
@@ -171,9 +171,9 @@ def choose(rows, first, last, node_weight, node_total, limits, state, order):
         feature = order[pick]
         order[pick], order[left] = order[left], feature
         column = U(feature)
-        low = high = keys[column + first * d]
+        low = high = keys[column + first * width]
         for i in range(first + U(1), last):
-            key = keys[column + i * d]
+            key = keys[column + i * width]
             low, high = min(low, key), max(high, key)
         if value_of(high) <= np.float32(value_of(low) + CONSTANT):
             constants += 1
@@ -181,11 +181,11 @@ def choose(rows, first, last, node_weight, node_total, limits, state, order):
         cut = draw_cut(low, high, bits >> U(32))
         w = s = np.int64(0)
         for i in range(first, last):
-            goes_left = -np.int64(keys[column + i * d] <= cut)  # all bits, or none
+            goes_left = -np.int64(keys[column + i * width] <= cut)  # all bits, or none
             count = weight[i] if weight.size > 0 else np.int64(1)
             w += count & goes_left
             s += (count * target[i]) & goes_left
-        score = _gain(low, high, w, s, node_weight, node_total, min_leaf)
+        score = gain(low, high, w, s, node_weight, node_total, min_leaf)
         if score > best:
             best, split = score, Split(feature, cut, w, s)
     return split, state

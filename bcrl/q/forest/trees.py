@@ -1,4 +1,4 @@
-"""Compiled extra-trees: growing a forest, and moving rows down a grown one.
+"""Compiled extra-trees: growing a forest.
 
 Buffers keep the rows of a node side by side. They hold three *planes*: the rows as
 given, and two that the levels of a tree use in turn. A split moves a node's rows from
@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.common.compiling import compiled, kept
+from bcrl.q.forest.descent import new_descent, planes, sort_node
+from bcrl.q.forest.lanes import LANES, choose_all, load, new_sums, store
 from bcrl.q.forest.split import (
     NODE,
     U,
@@ -22,31 +24,38 @@ from bcrl.q.forest.split import (
     uncounted,
 )
 
-TOGETHER = 1000  # from so many rows on, it is faster to move them together
-
 
 class Rows(NamedTuple):
     """The buffers of n rows of d features; `room` is 3 n."""
 
-    keys: NDArray[np.int32]  # (d · room,): the keys of a row are neighbours
-    words: NDArray[np.int64]  # the same memory: with d = 2, a word is a row
+    keys: NDArray[np.int32]  # (width · room,): those of a row are neighbours
+    words: NDArray[np.int64]  # the same memory: with width 2, a word is a row
     origin: NDArray[np.uint32]  # (room,): the index that the row was given under
-    target: NDArray[np.int64]  # (room,), or empty for queries
+    target: NDArray[np.int64]  # (room,)
     weight: NDArray[np.int64]  # (room,) multiplicities, or empty if all are 1
 
 
 @compiled()
-def _new_rows(x, has_targets, weighted):
+def _width(d):
+    """The keys of a row in memory: 2, or d > 2 rounded up to whole vectors.
+
+    One feature has a constant one beside it, which is never chosen.
+    """
+    return U(2) if d <= 2 else U((d + LANES - 1) // LANES * LANES)
+
+
+@compiled()
+def _new_rows(x, weighted):
     """Rows whose first plane holds x (n, d) float32; targets and weights are unset."""
-    n, d = U(x.shape[0]), U(x.shape[1])
+    n, width = U(x.shape[0]), _width(x.shape[1])
     room = U(3) * n
-    keys = np.empty(d * room + (d * room & U(1)), np.int32)
+    keys = np.empty(width * room, np.int32)
     origin = np.empty(room, np.uint32)
     for i in range(n):
         origin[i] = i
-        for f in range(d):
-            keys[i * d + f] = key_of(x[i, f])
-    target = np.empty(room if has_targets else U(0), np.int64)
+        for f in range(width):
+            keys[i * width + f] = key_of(x[i, f]) if f < U(x.shape[1]) else 0
+    target = np.empty(room, np.int64)
     weight = np.empty(room if weighted else U(0), np.int64)
     return Rows(keys, keys.view(np.int64), origin, target, weight)
 
@@ -58,21 +67,13 @@ def _plane(depth):
 
 
 @inlined
-def _move_rows(rows, n, d, depth, start, stop, feature, cut):
+def _move_rows(rows, n, width, depth, start, stop, feature, cut):
     """Move a node's rows to its children's plane; returns the left child's end."""
     keys, words, origin, target, weight = rows
     a, b = _plane(depth) * n, _plane(depth + 1) * n
     left, right = start, stop - U(1)
-    shift = np.int64(32) * feature
-    if d == U(2) and target.size == 0:  # a separate loop is 1.5 times as fast
-        for i in range(start, stop):
-            word = words[a + i]
-            goes_left = U(np.int32(word >> shift) <= cut)
-            to = left if goes_left else right
-            words[b + to], origin[b + to] = word, origin[a + i]
-            left += goes_left
-            right -= U(1) - goes_left
-    elif d == U(2):
+    if width == U(2):
+        shift = np.int64(32) * feature
         for i in range(start, stop):
             word = words[a + i]
             goes_left = U(np.int32(word >> shift) <= cut)
@@ -85,40 +86,34 @@ def _move_rows(rows, n, d, depth, start, stop, feature, cut):
             right -= U(1) - goes_left
     else:
         for i in range(start, stop):
-            goes_left = U(keys[(a + i) * d + U(feature)] <= cut)
-            to = left if goes_left else right
-            for f in range(d):
-                keys[(b + to) * d + f] = keys[(a + i) * d + f]
-            origin[b + to] = origin[a + i]
-            if target.size > 0:
-                target[b + to] = target[a + i]
+            source = (a + i) * width
+            goes_left = U(keys[source + U(feature)] <= cut)
+            to = left + ((right - i) & (goes_left - U(1)))  # a choice became a branch
+            there, more = (b + to) * width, U(LANES)
+            store(keys, there, load(keys, source))
+            while more < width:
+                store(keys, there + more, load(keys, source + more))
+                more += U(LANES)
+            origin[b + to], target[b + to] = origin[a + i], target[a + i]
             if weight.size > 0:
                 weight[b + to] = weight[a + i]
             left += goes_left
-            right -= U(1) - goes_left
     return left
-
-
-@inlined
-def _add_value(origin, start, stop, value, total):
-    """Add a leaf's value to `total` at its rows start:stop."""
-    for i in range(start, stop):
-        total[origin[i]] += value
 
 
 @uncounted
 def _grow_tree(
-    rows, queries, d, whole, settings, state, work, fitted, queried, tree, at, keep
+    rows, queries, width, whole, settings, state, work, fitted, queried, tree, at, keep
 ):
     """Grow one tree depth first and add its predictions to `fitted` and `queried`.
 
     whole: weight of all rows, their sum of targets, and the target of fixed-point 1;
-    work: a permutation of the features and a stack; tree: nodes and values, filled from
-    `at` on if `keep`. Returns the new `at` and the tree's depth.
+    work: a permutation of the features, sums and a stack; tree: nodes and values,
+    filled from `at` on if `keep`. Returns the new `at` and the tree's depth.
     """
     min_split, min_leaf, max_features, max_depth = settings
     node_weight, node_total, unit = whole
-    order, stack = work
+    order, sums, stack = work
     for f in range(order.size):  # a tree depends on its seed alone
         order[f] = f
     nodes, values = tree
@@ -127,7 +122,8 @@ def _grow_tree(
     n_nodes += 1
     n, m = U(fitted.size), U(queried.size)
     start, stop, q_start, q_stop = U(0), n, U(0), m
-    both = d == U(2) and max_features >= 2  # or more than there are features
+    for i in range(m):
+        queries.one[i] = np.uint32(i)
     while True:
         here = _plane(depth) * n
         first, last = here + start, here + stop
@@ -135,21 +131,43 @@ def _grow_tree(
         enough = node_weight >= min_split and node_weight >= 2 * min_leaf
         may_split = enough and depth < max_depth
         if may_split and not is_pure(rows, first, last, node_weight, unit):
-            if both:
+            if max_features < order.size:
+                limits = min_leaf, max_features
+                split, state = choose(
+                    rows,
+                    width,
+                    first,
+                    last,
+                    node_weight,
+                    node_total,
+                    limits,
+                    state,
+                    order,
+                )
+            elif width == U(2):
                 split, state = choose_two(
                     rows, first, last, node_weight, node_total, min_leaf, state
                 )
             else:
-                limits = min_leaf, max_features
-                split, state = choose(
-                    rows, first, last, node_weight, node_total, limits, state, order
+                split, state = choose_all(
+                    rows,
+                    first,
+                    last,
+                    node_weight,
+                    node_total,
+                    min_leaf,
+                    state,
+                    order,
+                    sums,
                 )
             feature, cut, w_left, s_left = split
         if feature < 0:
             value = node_total * unit / node_weight
-            _add_value(rows.origin, first, last, value, fitted)
-            here = _plane(depth) * m
-            _add_value(queries.origin, here + q_start, here + q_stop, value, queried)
+            for i in range(first, last):
+                fitted[rows.origin[i]] += value
+            there, _ = planes(queries, depth)
+            for i in range(q_start, q_stop):
+                queried[there[i]] += value
             if keep:
                 nodes[node].cut, nodes[node].feature = 0, -1
                 nodes[node].child = n_values
@@ -164,10 +182,10 @@ def _grow_tree(
             q_start, q_stop = U(stack[top, 4]), U(stack[top, 5])
             node_weight, node_total = stack[top, 6], stack[top, 7]
             continue
-        middle = _move_rows(rows, n, d, depth, start, stop, feature, cut)
+        middle = _move_rows(rows, n, width, depth, start, stop, feature, cut)
         q_middle = q_start
         if q_start < q_stop:
-            q_middle = _move_rows(queries, m, d, depth, q_start, q_stop, feature, cut)
+            q_middle = sort_node(queries, depth, q_start, q_stop, feature, cut)
         if keep:
             nodes[node].cut, nodes[node].feature = cut, feature
             nodes[node].child = n_nodes
@@ -191,8 +209,8 @@ def grow_forest(x, y, multiplicity, seeds, queries, settings, keep):
     fields of `TreeSettings`. Returns nodes, leaf values, first node of each tree
     (T+1,), depths (T,), fitted (n,), queried (m,); no nodes and values unless `keep`.
     """
-    weighted, n, trees = multiplicity.size > 0, x.shape[0], seeds.size
-    rows, query_rows = _new_rows(x, True, weighted), _new_rows(queries, False, False)
+    weighted, (n, d), trees = multiplicity.size > 0, x.shape, seeds.size
+    rows, width = _new_rows(x, weighted), _width(d)
     weight, largest = multiplicity.sum() if weighted else n, np.abs(y).max()
     bits = 0.0
     if largest > 0.0:  # as many as keep every sum of targets below 2^62
@@ -204,82 +222,16 @@ def grow_forest(x, y, multiplicity, seeds, queries, settings, keep):
         rows.target[i] = np.int64(np.rint(y[i] * 2.0**bits))
         total += rows.target[i] * (multiplicity[i] if weighted else 1)
     fitted, queried = np.zeros(n), np.zeros(queries.shape[0])
-    work = np.arange(x.shape[1]), np.empty((n + 1, 8), np.int64)
+    work = np.arange(d), new_sums(width), np.empty((n + 1, 8), np.int64)
+    descent = new_descent(queries)
     first, depths = np.zeros(trees + 1, np.int64), np.empty(trees, np.int64)
     room = trees * n if keep else 0  # leaves that there can be; unused memory is free
     tree = np.empty(2 * room, NODE), np.empty(room, np.float64)
-    whole, d, leaves = (weight, total, 2.0**-bits), U(x.shape[1]), 0
+    whole, leaves = (weight, total, 2.0**-bits), 0
     for t in range(trees):
-        buffers = rows, query_rows, d, whole, settings, seeds[t], work
+        buffers = rows, descent, width, whole, settings, seeds[t], work
         at = first[t], leaves
         at, depths[t] = _grow_tree(*buffers, fitted, queried, tree, at, keep)
         first[t + 1], leaves = at
     nodes, values = tree[0][: first[trees]].copy(), tree[1][:leaves].copy()
     return nodes, values, first, depths, fitted / trees, queried / trees
-
-
-@uncounted
-def _move_down(rows, d, nodes, values, root, stack, total):
-    """Add one tree's predictions to `total`, moving all rows down together."""
-    node, depth, top, n = root, 0, 0, U(total.size)
-    start, stop = U(0), n
-    while True:
-        child, feature = nodes[node].child, nodes[node].feature
-        if feature < 0:
-            here = _plane(depth) * n
-            _add_value(rows.origin, here + start, here + stop, values[child], total)
-        else:
-            cut = nodes[node].cut
-            middle = _move_rows(rows, n, d, depth, start, stop, feature, cut)
-            depth += 1
-            if middle < stop:
-                stack[top, 0], stack[top, 1] = child + 1, depth
-                stack[top, 2], stack[top, 3] = middle, stop
-                top += 1
-            if start < middle:
-                node, stop = np.int64(child), middle
-                continue
-        if top == 0:
-            return
-        top -= 1
-        node, depth = stack[top, 0], stack[top, 1]
-        start, stop = U(stack[top, 2]), U(stack[top, 3])
-
-
-@uncounted
-def _walk_down(keys, nodes, values, root, at, who, total):
-    """Add one tree's predictions to `total`, level by level: reads then overlap."""
-    left = total.size
-    for i in range(left):
-        at[i], who[i] = root, i
-    while left > 0:
-        kept = 0
-        for j in range(left):
-            i, node = who[j], at[j]
-            feature = nodes[node].feature
-            if feature < 0:
-                total[i] += values[nodes[node].child]
-            else:
-                right = keys[i, feature] > nodes[node].cut
-                at[kept], who[kept] = np.int64(nodes[node].child) + right, i
-                kept += 1
-        left = kept
-
-
-@kept(nogil=True)
-def predict_forest(nodes, values, first, x):
-    """Mean over the trees at x (m, d) float32, as float64 (m,)."""
-    trees, (m, d) = first.size - 1, x.shape
-    total = np.zeros(m)
-    if m >= TOGETHER:
-        rows, stack = _new_rows(x, False, False), np.empty((m + 1, 4), np.int64)
-        for t in range(trees):
-            _move_down(rows, U(d), nodes, values, first[t], stack, total)
-    else:
-        keys, (at, who) = np.empty(x.shape, np.int32), np.empty((2, m), np.int64)
-        for i in range(m):
-            for f in range(d):
-                keys[i, f] = key_of(x[i, f])
-        for t in range(trees):
-            _walk_down(keys, nodes, values, first[t], at, who, total)
-    return total / trees

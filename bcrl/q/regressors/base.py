@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bcrl.common.seeding import stream
 from bcrl.common.serialization import DERIVED, storable
 from bcrl.errors import BcrlError, ConfigError, LostSeeds
-from bcrl.q.functions import Values
+from bcrl.q.functions import Values, each
 
 
 @storable
@@ -75,7 +75,7 @@ class Fitted:
         return cls(replace(problem, queries=problem.queries[:0]), fit.model)
 
 
-Cell = tuple[int, int]  # a seed's index in its batch, and an action
+Cell = tuple[int, ...]  # a seed's index in its batch, an action; the term of a sum
 
 
 def fit_each(
@@ -106,7 +106,7 @@ def _by_seed(
     except ConfigError:  # concerns all seeds
         raise
     except Exception as error:  # a user's regressor may raise anything
-        seeds = dict.fromkeys(s for s, _ in cells)
+        seeds = dict.fromkeys(cell[0] for cell in cells)
         if len(seeds) == 1:
             return {}, dict.fromkeys(seeds, _reason(regressor, what, error))
     found: dict[Cell, Any] = {}
@@ -133,6 +133,9 @@ def _reason(regressor: Regressor, what: str, error: Exception) -> str:
     return f"algorithm.regressor={name}: {what} failed: {text}"
 
 
+FEW = 1000  # states; more take much memory, since each model has its own copy
+
+
 @storable
 @dataclass(frozen=True)
 class FittedQ:
@@ -143,31 +146,47 @@ class FittedQ:
     team: Any  # its `threads` may be used
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        lost = [f for row in self.models for f in row if f and f.model is None]
+        return self.together([self], states, n_actions)[0]
+
+    @staticmethod
+    def together(
+        terms: "Sequence[FittedQ]", states: Sequence[NDArray], n_actions: int
+    ) -> list[Values]:
+        """The values of each term; at few states all are predicted in one call.
+
+        A boosted Q is a sum of many terms, and an episode's step queries few states.
+        """
+        regressor, threads = terms[0].regressor, terms[0].team.threads
+        mixed = any(term.regressor is not regressor for term in terms)
+        if len(terms) > 1 and (mixed or sum(map(len, states)) > FEW):
+            return [term(states, n_actions) for term in terms]
+        every = [fitted for term in terms for row in term.models for fitted in row]
+        lost = [fitted for fitted in every if fitted and fitted.model is None]
         if lost:  # what a checkpoint has left out is fitted again
             problems = [deepcopy(fitted.problem) for fitted in lost]
-            fits = self.regressor.fit(problems, True, self.team.threads)
+            fits = regressor.fit(problems, True, threads)
             for fitted, fit in zip(lost, fits, strict=True):
                 fitted.model = fit.model
-        models = {
-            (s, a): fitted.model
-            for s, row in enumerate(self.models)
+        models: dict[Cell, Any] = {
+            (s, a, k): fitted.model
+            for k, term in enumerate(terms)
+            for s, row in enumerate(term.models)
             for a, fitted in enumerate(row)
             if fitted is not None and len(states[s])
         }
 
         def predict(cells: list[Cell]) -> list[NDArray[np.float64]]:
             own = [models[cell] for cell in cells]
-            points = [states[s].copy() for s, _ in cells]  # it may change them
-            found = self.regressor.predict(own, points, self.team.threads)
+            points = [states[s].copy() for s, *_ in cells]  # it may change them
+            found = regressor.predict(own, points, threads)
             for x, values in zip(points, found, strict=True):
                 _check_shape(values, len(x))
             return found
 
-        found, failed = _by_seed(self.regressor, "predict", predict, list(models))
+        found, failed = _by_seed(regressor, "predict", predict, list(models))
         if failed:
             raise LostSeeds(failed)
-        out = [np.zeros((len(x), n_actions)) for x in states]
-        for (s, a), values in found.items():
-            out[s][:, a] = values
-        return np.stack(out) if isinstance(states, np.ndarray) else out
+        out = [[np.zeros((len(x), n_actions)) for x in states] for _ in terms]
+        for (s, a, k), values in found.items():
+            out[k][s][:, a] = values
+        return [each(states, own.__getitem__) for own in out]
