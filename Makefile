@@ -5,6 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 SCALE ?= quick
 PYTEST := $(BIN)/python -m pytest
+ONE_THREAD := OMP_NUM_THREADS=1 RAYON_NUM_THREADS=1
 WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 
 # Without bytecode each process would compile all of torch again.
@@ -12,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help setup figures paper searches smoke report verify test test-all lint docs bench \
-	bench-peer clean
+	bench-peers clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -78,13 +79,18 @@ bench: $(READY) ## measure speed, as ratios against a plain implementation in on
 	$(BIN)/python bench/classic.py
 	test ! -d runs/paper || $(BIN)/python bench/paper.py
 
-bench-peer: $(READY) ## the same against MushroomRL 1.10.2, in a separate environment
-	test -x .venv-peer/bin/python || $(PYTHON) -m venv .venv-peer
-	.venv-peer/bin/python -m pip install --quiet --constraint constraints.txt --editable .
-	.venv-peer/bin/python -m pip install --quiet pygame==2.6.1 opencv-python-headless==5.0.0.93
-	.venv-peer/bin/python -m pip install --quiet --no-deps mushroom-rl==1.10.2
-	.venv-peer/bin/python bench/peer.py
+# MushroomRL would install more packages than its agents need here.
+.venv-peers-%/.ready: bench/peers/%.txt constraints.txt pyproject.toml
+	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	$(@D)/bin/python -m pip install --quiet --constraint constraints.txt --editable . -r $<
+	test $* != dqn || $(@D)/bin/python -m pip install --quiet --no-deps mushroom-rl==1.10.2
+	@touch $@
+
+bench-peers: .venv-peers-forests/.ready .venv-peers-dqn/.ready ## the same against other packages, in separate environments
+	$(ONE_THREAD) .venv-peers-forests/bin/python bench/peer_forests.py
+	$(ONE_THREAD) .venv-peers-dqn/bin/python bench/peer_dqn.py
+	$(ONE_THREAD) .venv-peers-dqn/bin/python bench/peer_fqi.py
 
 clean: ## remove .venv and caches; results in runs/ stay
-	rm -rf $(VENV) .venv-peer .pytest_cache .ruff_cache .mypy_cache .import_linter_cache site
+	rm -rf $(VENV) .venv-peers-* .pytest_cache .ruff_cache .mypy_cache .import_linter_cache site
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

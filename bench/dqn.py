@@ -13,15 +13,17 @@ import copy
 import itertools
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
+from bcrl.envs.base import Env
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.evaluation.step_metrics import evaluate
 from bcrl.learning.dqn import DQN
-from bcrl.learning.stage import SeedBatch, Snapshot, Stage, StepSnapshot
+from bcrl.learning.stage import SeedBatch, Snapshot, Stage
 from bcrl.learning.transfer import StageInit
 
 ENV, STEPS, FILL = LinearSystem(), 1000, 600
@@ -73,11 +75,11 @@ def plain() -> Iterator[None]:
         yield
 
 
-def lockstep(n_seeds: int) -> Iterator[StepSnapshot]:
-    """Many seeds, STEPS steps at each `next`."""
-    learner = DQN(steps=10**9, evaluate_every=STEPS)
-    stage = Stage(1, 1, ENV, learner, (), 0)
-    team = SeedBatch(tuple(range(n_seeds)), np.zeros((1, 4)))
+def lockstep(n_seeds: int, env: Env = ENV, steps: int = STEPS) -> Iterator[Any]:
+    """Many seeds, `steps` steps and a snapshot at each `next`."""
+    learner = DQN(steps=10**9, evaluate_every=steps)
+    stage = Stage(1, 1, env, learner, (), 0)
+    team = SeedBatch(tuple(range(n_seeds)), np.zeros((1, env.state_dim)))
     pauses = learner.learn(stage, StageInit(), team)
     return (pause for pause in pauses if isinstance(pause, Snapshot))
 

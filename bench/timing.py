@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Sequence
+
+
+def one_core() -> None:
+    """Keep this process, with all threads that libraries start later, on one core."""
+    if hasattr(os, "sched_setaffinity"):  # Linux
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 
 def by_turns(calls: Sequence[Callable[[], object]], turns: int) -> list[float]:
