@@ -25,8 +25,8 @@ def needed(job: Job) -> dict[str, int]:
     for stage in plan.stages:
         env, learner = stage.env, vars(stage.learner)
         d, finite = env.state_dim, is_finite(env)
-        # States as float64 and, unless they are looked up, a copy; then the draws.
-        episode = 8 * (env.horizon + 1) * ((2 - finite) * d + 2 + env.step_noise)
+        # States as float64 and draws; a copy has only the steps that episodes had.
+        episode = 8 * (env.horizon + 1) * (d + 4 + env.step_noise)
         row = 4 * (2 * d + env.n_actions + 4) + 1  # of learning/replay.py
         episodes, held = learner.get("episodes", 0), learner.get("replay_size", 0)
         trees = 0 if finite else getattr(learner.get("regressor"), "trees", 0)
@@ -40,8 +40,8 @@ def needed(job: Job) -> dict[str, int]:
     return {key: len(job.seeds) * size for key, size in found.items() if size}
 
 
-def estimate(job: Job) -> float:
-    """Bytes of a process that does a job, at most."""
+def expected_bytes(job: Job) -> float:
+    """Bytes of a process that does a job."""
     return _base(job) + sum(needed(job).values())
 
 
@@ -64,7 +64,7 @@ def available() -> float:
     return min(limits)
 
 
-def check(jobs: Sequence[Job]) -> None:
+def check_fits(jobs: Sequence[Job]) -> None:
     """Raise ConfigError if the data of the largest jobs that run at once can't fit."""
     workers, there = jobs[0].plan.config["workers"], available()
     certain = [{k: n for k, n in needed(job).items() if k != _FOREST} for job in jobs]

@@ -94,7 +94,7 @@ def _train(jobs: Sequence[Job], failed: Failures, stop: Stop) -> None:
         if plan.family == "FQI" and needs_reference(plan.metrics):
             for task in (plan.target, *(stage.env for stage in plan.stages)):
                 oracle.reference(task)  # without Q*, the command ends before any work
-    memory.check(jobs)
+    memory.check_fits(jobs)
     options = jobs[0].plan.config
     workers = min(options["workers"], len(jobs))
     threads = options["threads"] or max(1, cores() // workers)

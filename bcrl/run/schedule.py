@@ -66,9 +66,9 @@ def ordered(plans: Sequence[Plan], failed: Failures) -> list[Job]:
         if left:
             new.append((plan, left))
     workers = plans[0].config["workers"]
-    # With enough variants for all workers, larger batches cost less per seed.
-    spread = 1 if len(new) >= 2 * workers else workers
     for plan, seeds in new:
+        # Larger batches cost less per seed: on a GPU, and if all workers have variants.
+        spread = 1 if plan.device == "cuda" or len(new) >= 2 * workers else workers
         least = -(-len(seeds) // plan.lockstep)  # batches of at most `lockstep` seeds
         number = min(-(-least // spread) * spread, len(seeds))  # even for the workers
         jobs += [Job(plan, tuple(p.tolist())) for p in np.array_split(seeds, number)]

@@ -22,14 +22,16 @@ def dry_run(plans: Sequence[Plan]) -> str:
         todo = layout.spelled([seed for job in own for seed in job.seeds])
         done = len(plan.seeds) - len(records.pending(plan))
         minutes = sum(job.seconds for job in own) / 60
-        most = max((memory.estimate(job) / memory.GIB for job in own), default=0.0)
+        most = max(
+            (memory.expected_bytes(job) / memory.GIB for job in own), default=0.0
+        )
         rows[str(plan.directory)] = [done, todo, len(own), minutes, most]
     hopeless = [why for reasons in failed.values() for why in set(reasons.values())]
     seconds, workers = [job.seconds for job in left], plans[0].config["workers"]
     wall = f"{costs.makespan(seconds, workers) / 60:.1f} min with workers={workers}"
     total = f"{len(left)} jobs, about {sum(seconds) / 60:.1f} core minutes"
-    at_once = sum(sorted(map(memory.estimate, left))[-workers:]) / memory.GIB
-    most = f"at most {at_once:.1f} of {memory.available() / memory.GIB:.1f} GiB"
+    at_once = sum(sorted(map(memory.expected_bytes, left))[-workers:]) / memory.GIB
+    most = f"about {at_once:.1f} of {memory.available() / memory.GIB:.1f} GiB"
     last = f"{total}, {wall}, {most}; nothing was run or written"
     table = _table(rows, "complete", "to do", "jobs", "core min", "GiB per job")
     return "\n".join([table, *hopeless, last])

@@ -11,6 +11,7 @@ import pytest
 from bcrl import api
 from bcrl.config import jobs
 from bcrl.config import plan as compose
+from bcrl.config.algorithms import fqi
 from bcrl.config.hydra_compose import catalog, composed, read_option
 from bcrl.errors import ConfigError
 from bcrl.learning.curriculum import CURRICULA
@@ -87,6 +88,9 @@ def by_api(config: dict):
         if own.pop("name") == "fqi":
             values = dict(own.pop("regressor"))
             regressor = REGRESSORS[values.pop("name")](**values)
+            if own["evaluate_every"] is None:
+                budget = own["iterations"], own["episodes"]
+                own["evaluate_every"] = fqi.interval(tasks[slot], *budget)
             own["new_data"] = own["new_data"] == "stage"
             own["shared_data"] = own.pop("dataset") == "shared"
             own["fixed_trees"] = own.pop("fit_randomness") == "fixed"

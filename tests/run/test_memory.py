@@ -20,7 +20,7 @@ def test_the_estimate_is_that_of_the_replay_memory(tmp_path):
     assert replay.rows.numpy().dtype == np.float32
     size = sum(array.nbytes for array in arrays)
     assert memory.needed(job)["algorithm.replay_size"] == size
-    assert memory.estimate(job) > size
+    assert memory.expected_bytes(job) > size
 
 
 @pytest.mark.parametrize("algorithm", ["dqn", "fqi"])
@@ -41,9 +41,9 @@ def test_what_cannot_fit_is_rejected_before_work(
         words.append("algorithm.steps=100000000")
     p = plan(*words)
     job = ordered([p], Failures())[0]
-    room = workers * memory.estimate(job)
+    room = workers * memory.expected_bytes(job)
     monkeypatch.setattr(memory, "available", lambda: room)
-    memory.check(ordered([p], Failures()))
+    memory.check_fits(ordered([p], Failures()))
     monkeypatch.setattr(memory, "available", lambda: room / 100)
     with pytest.raises(ConfigError) as caught:
         runner.run(p)

@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,7 +20,7 @@ from bcrl.run.workers import cores, do_jobs
 from tests.conftest import arguments, plan, plans
 from tests.results.made_up import made_up_plan, write_seeds
 from tests.run.light import work
-from tests.run.runs import TABULAR
+from tests.run.runs import LINEAR, TABULAR
 
 
 def test_the_longest_jobs_come_first_and_each_seed_once(tmp_path):
@@ -30,6 +31,16 @@ def test_the_longest_jobs_come_first_and_each_seed_once(tmp_path):
     assert expected == sorted(expected, reverse=True)
     seeds = [(each.plan.directory, seed) for each in work for seed in each.seeds]
     assert len(seeds) == len(set(seeds)) == 4 * 3
+
+
+def test_processes_share_the_seeds_but_on_a_gpu_one_has_as_many_as_may_be(tmp_path):
+    words = (*LINEAR, "seeds=90", "seeds.lockstep=60", "workers=4", "variant=plain")
+    made = plan(*words, f"runs_dir={tmp_path}")
+    sizes = {
+        device: [len(job.seeds) for job in ordered([replace(made, device=device)], {})]
+        for device in ("cpu", "cuda")
+    }
+    assert sizes == {"cpu": [23, 23, 22, 22], "cuda": [45, 45]}
 
 
 def test_the_parts_of_seeds_are_all_of_them_once():

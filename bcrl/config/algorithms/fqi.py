@@ -45,7 +45,7 @@ def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
         own: _Settings = construct("algorithm", _Settings, values)
         every = own.evaluate_every
         if every is None:
-            every = _interval(env, own.iterations, own.episodes)
+            every = interval(env, own.iterations, own.episodes)
         arguments = dict(own.regressor)
         cls = regressor_class(str(arguments.pop("name", None)))
         learners.append(
@@ -63,7 +63,7 @@ def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
     return course(chosen, learners)
 
 
-def _interval(env: Env, iterations: int, episodes: int) -> int:
+def interval(env: Env, iterations: int, episodes: int) -> int:
     """Iterations between two evaluations that take `_SHARE` of a stage's time at most.
 
     At least the last iteration is evaluated. Evaluated and collected episodes have the
