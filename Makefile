@@ -56,7 +56,7 @@ test: $(READY) ## the fast tests (about 4 minutes on two cores)
 test test-all: export OMP_NUM_THREADS = 1
 
 test-all: $(READY) ## all tests, with the fast ones' coverage of the package
-	$(PYTEST) --numprocesses 3 --dist worksteal \
+	$(PYTEST) --numprocesses 4 --dist worksteal \
 	  --cov=bcrl --cov-report=term --cov-fail-under=90
 
 lint: $(READY) ## style, spelling, layers of imports, types
