@@ -28,7 +28,7 @@ from tests.conftest import plan
 from tests.run.runs import KINDS, MAZE, TABULAR, about, at_row, compared, run
 
 KILLS = int(os.environ.get("BCRL_KILLS", "0"))
-FEW = ("maze C", "car_on_hill C", "dqn SBC")
+FEW = ("maze C", "car_on_hill C", "dqn C", "dqn SBC")
 ROOT = Path(__file__).parents[2]
 
 
@@ -172,12 +172,13 @@ def test_a_run_killed_at_any_moment_resumes_and_ends_in_equal_files(tmp_path, na
 
 
 @pytest.mark.slow
-def test_each_seed_is_computed_once_by_racing_processes(tmp_path):
-    assert kill(tmp_path, "race of 6")["computed"] == list(range(6))
+@pytest.mark.parametrize("processes", [2, 8])
+def test_each_seed_is_computed_once_by_racing_processes(tmp_path, processes):
+    assert kill(tmp_path, f"race of {processes}")["computed"] == list(range(6))
 
 
 LONG = ("env=maze", "curriculum=on", "boosting=on", "tag=x", "seeds.count=2")
-LONG += ("seeds.lockstep=1", "algorithm.iterations=6", "threads=1")
+LONG += ("seeds.lockstep=1", "algorithm.iterations=15", "threads=1")
 #: A shell's background jobs, and so perhaps this test, ignore SIGINT from the start.
 PROGRAM = """
 import signal, sys
