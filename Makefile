@@ -5,7 +5,6 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 SCALE ?= quick
 PYTEST := $(BIN)/python -m pytest
-ONE_THREAD := OMP_NUM_THREADS=1 RAYON_NUM_THREADS=1
 WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 
 # Without bytecode each process would compile all of torch again.
@@ -52,8 +51,9 @@ verify: $(READY) ## check that every result in runs/ is complete, unchanged and 
 test: $(READY) ## the fast tests (about 4 minutes on two cores)
 	$(PYTEST) --numprocesses 2 -m "not slow and not slurm and not browser"
 
-# Tests share the cores among processes, not threads.
-test test-all: export OMP_NUM_THREADS = 1
+# Tests share the cores among processes, and a benchmark has one.
+test test-all bench-peers: export OMP_NUM_THREADS = 1
+bench-peers: export RAYON_NUM_THREADS = 1
 
 test-all: $(READY) ## all tests, with the fast ones' coverage of the package
 	$(PYTEST) --numprocesses 4 --dist worksteal \
@@ -87,9 +87,9 @@ bench: $(READY) ## measure speed, as ratios against a plain implementation in on
 	@touch $@
 
 bench-peers: .venv-peers-forests/.ready .venv-peers-dqn/.ready ## the same against other packages, in separate environments
-	$(ONE_THREAD) .venv-peers-forests/bin/python bench/peer_forests.py
-	$(ONE_THREAD) .venv-peers-dqn/bin/python bench/peer_dqn.py
-	$(ONE_THREAD) .venv-peers-dqn/bin/python bench/peer_fqi.py
+	.venv-peers-forests/bin/python bench/peer_forests.py
+	.venv-peers-dqn/bin/python bench/peer_dqn.py
+	.venv-peers-dqn/bin/python bench/peer_fqi.py
 
 clean: ## remove .venv and caches; results in runs/ stay
 	rm -rf $(VENV) .venv-peers-* .pytest_cache .ruff_cache .mypy_cache .import_linter_cache site

@@ -14,7 +14,7 @@ from bcrl.common import plugins
 from bcrl.config import hydra_compose, jobs
 from bcrl.config.plan import Plan
 
-LONG = ("slow", "slurm", "browser", "untraced")
+LONG = ("slow", "slurm", "browser")
 
 
 @contextmanager

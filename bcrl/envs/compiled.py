@@ -19,9 +19,9 @@ def compiled_step(one: Callable) -> Callable[..., Step]:
     `one(state, action, noise, *constants)` gets a state (d,), an action's number, noise
     (k,) and the constants: numbers, tuples or arrays. It returns the next state as a
     tuple of d floats, the reward, and whether the next state is absorbing. numba
-    compiles it. What the decorator returns has the same arguments, but takes and gives
-    arrays with any leading axes, as `Env.step` does. Noise may be None if `one` needs
-    none. Raises TypeError if numba cannot compile `one`.
+    compiles it. The new step has the same arguments, but takes and gives arrays with
+    any leading axes, as `Env.step` does. Noise may be None if `one` needs none. Raises
+    TypeError if numba cannot compile `one`.
     """
     options = {"nogil": True, "error_model": "numpy"}
     loop = kept(_loop_over(one, kept(one, **options)), **options)

@@ -67,17 +67,23 @@ def available() -> float:
 def check_fits(jobs: Sequence[Job]) -> None:
     """Raise ConfigError if the data of the largest jobs that run at once can't fit."""
     workers, there = jobs[0].plan.config["workers"], available()
-    certain = [{k: n for k, n in needed(job).items() if k != _FOREST} for job in jobs]
-    sizes = [_base(j) + sum(n.values()) for j, n in zip(jobs, certain, strict=True)]
-    largest = sorted(range(len(jobs)), key=lambda i: -sizes[i])[:workers]
-    total, first = sum(sizes[i] for i in largest), jobs[largest[0]]
-    if total <= there or not certain[largest[0]]:
+    largest = sorted(jobs, key=_certain_bytes, reverse=True)[:workers]
+    total, first = sum(map(_certain_bytes, largest)), largest[0]
+    sizes = _certain(first)
+    if total <= there or not sizes:
         return
-    key = max(certain[largest[0]], key=certain[largest[0]].__getitem__)
+    key = max(sizes, key=sizes.__getitem__)
     value = first.plan.config["algorithm"].get(key.rpartition(".")[2])
-    why = (
-        f"{first.plan.env} {first.plan.name} and what runs with it (workers={workers})"
-    )
-    why += f" need {total / GIB:.1f} GiB of memory, but there are {there / GIB:.1f}; "
-    why += f"lower {key}, workers, or seeds.lockstep (now {len(first.seeds)})"
-    raise ConfigError(key, value, why)
+    what = f"{first.plan.env} {first.plan.name} and what runs with it"
+    why = f"{what} (workers={workers}) need {total / GIB:.1f} GiB of memory, but there "
+    why += f"are {there / GIB:.1f}; lower {key}, workers, or seeds.lockstep "
+    raise ConfigError(key, value, why + f"(now {len(first.seeds)})")
+
+
+def _certain(job: Job) -> dict[str, int]:
+    """What a job needs but for its forests, whose estimate is from above."""
+    return {key: size for key, size in needed(job).items() if key != _FOREST}
+
+
+def _certain_bytes(job: Job) -> float:
+    return _base(job) + sum(_certain(job).values())

@@ -17,22 +17,21 @@ def dry_run(plans: Sequence[Plan]) -> str:
     """The jobs that these plans would be now, and their expected costs."""
     plans, failed, rows = merged(plans), Failures(), {}
     left = ordered(plans, failed)
+    sizes = [(job, memory.expected_bytes(job)) for job in left]
     for plan in plans:
         own = [job for job in left if job.plan is plan]
         todo = layout.spelled([seed for job in own for seed in job.seeds])
         done = len(plan.seeds) - len(records.pending(plan))
         minutes = sum(job.seconds for job in own) / 60
-        most = max(
-            (memory.expected_bytes(job) / memory.GIB for job in own), default=0.0
-        )
-        rows[str(plan.directory)] = [done, todo, len(own), minutes, most]
+        each = max((size for job, size in sizes if job.plan is plan), default=0.0)
+        rows[str(plan.directory)] = [done, todo, len(own), minutes, each / memory.GIB]
     hopeless = [why for reasons in failed.values() for why in set(reasons.values())]
     seconds, workers = [job.seconds for job in left], plans[0].config["workers"]
     wall = f"{costs.makespan(seconds, workers) / 60:.1f} min with workers={workers}"
     total = f"{len(left)} jobs, about {sum(seconds) / 60:.1f} core minutes"
-    at_once = sum(sorted(map(memory.expected_bytes, left))[-workers:]) / memory.GIB
-    most = f"about {at_once:.1f} of {memory.available() / memory.GIB:.1f} GiB"
-    last = f"{total}, {wall}, {most}; nothing was run or written"
+    at_once = sum(sorted(size for _, size in sizes)[-workers:]) / memory.GIB
+    room = f"about {at_once:.1f} of {memory.available() / memory.GIB:.1f} GiB"
+    last = f"{total}, {wall}, {room}; nothing was run or written"
     table = _table(rows, "complete", "to do", "jobs", "core min", "GiB per job")
     return "\n".join([table, *hopeless, last])
 
@@ -74,14 +73,10 @@ def diverging_lines(plan: Plan) -> list[str]:
 
 def _table(rows: dict[str, list[Any]], *columns: str) -> str:
     """Rows by name as aligned lines."""
-    shown = [["", *columns]]
-    for name, row in rows.items():
-        shown.append(
-            [name, *(f"{x:.1f}" if isinstance(x, float) else str(x) for x in row)]
-        )
-    name_width, *widths = (max(map(len, column)) for column in zip(*shown, strict=True))
-    lines = []
-    for name, *cells in shown:
-        right = (cell.rjust(w) for cell, w in zip(cells, widths, strict=True))
-        lines.append("  ".join([name.ljust(name_width), *right]))
-    return "\n".join(lines)
+    texts = [
+        [name, *(f"{x:.1f}" if isinstance(x, float) else f"{x}" for x in row)]
+        for name, row in {"": columns, **rows}.items()
+    ]
+    first, *others = (max(map(len, column)) for column in zip(*texts, strict=True))
+    form = "  ".join([f"{{:<{first}}}", *(f"{{:>{width}}}" for width in others)])
+    return "\n".join(form.format(*line) for line in texts)

@@ -13,7 +13,6 @@ from bcrl.errors import BcrlError
 from tests.config.helpers import own, rows
 from tests.conftest import plan, plans
 
-pytestmark = pytest.mark.untraced  # one composition after the other
 MAZE = "env=maze"
 
 

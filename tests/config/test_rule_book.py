@@ -36,8 +36,6 @@ def options(group: str) -> dict[str, dict]:
     return {name: read_option(group, name) for name in catalog()[group]}
 
 
-pytestmark = pytest.mark.untraced  # most calls repeat others with other values
-
 #: The choices besides env and algorithm; an option added to conf/ is covered, too.
 CHOICES = [options(group) for group in ("curriculum", "boosting", "transfer")]
 #: What an algorithm's own section may say of learners and regressors.
