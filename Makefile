@@ -5,6 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 SCALE ?= quick
 PYTEST := $(BIN)/python -m pytest
+PIP ?= $(BIN)/python -m pip install --quiet --no-compile
 WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 
 # Without bytecode each process would compile all of torch again.
@@ -23,7 +24,7 @@ $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "bcrl needs Python 3.11 or newer; use make PYTHON=python3.11"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[dev]'
+	$(PIP) --constraint constraints.txt --editable '.[dev]'
 	@touch $@
 
 figures: $(READY) ## run the paper's experiments with 3 seeds per method and draw the figures
