@@ -19,6 +19,8 @@ from bcrl.learning.stage import Stage
 from bcrl.learning.transfer import PolicyReuse, ResidualPolicy, Shape
 from bcrl.results.loggers import logger
 
+LOCKSTEP_ON_GPU = 500  # seeds: a step takes little longer than that of 100
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -75,6 +77,8 @@ def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
     chosen = composition(config, tasks)
     stages = module.stages(config["algorithm"], chosen)
     asked = _asked(config["seeds"])
+    device = usable_device(config["device"], module.FAMILY)
+    own_lockstep = LOCKSTEP_ON_GPU if device == "cuda" else module.LOCKSTEP
     return Plan(
         env=env,
         variant=_variant(config["algorithm"]["name"], chosen),
@@ -85,8 +89,8 @@ def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
         metrics=metrics,
         asked=asked,
         seeds=part(asked, config["seeds"]["part"]),
-        lockstep=config["seeds"]["lockstep"] or module.LOCKSTEP,
-        device=usable_device(config["device"], module.FAMILY),
+        lockstep=config["seeds"]["lockstep"] or own_lockstep,
+        device=device,
         config=config,
         sources=plugins.fingerprint(config),
         **more,
