@@ -76,7 +76,9 @@ class Zero:
     """Q = 0, what an approximator predicts before its first fit."""
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        return each(states, lambda s: np.zeros((len(states[s]), n_actions)))
+        if isinstance(states, np.ndarray):
+            return np.zeros((*states.shape[:-1], n_actions))
+        return [np.zeros((len(x), n_actions)) for x in states]
 
 
 ZERO = Zero()

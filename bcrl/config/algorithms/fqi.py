@@ -17,8 +17,8 @@ from bcrl.q.regressors.ours import regressor_class
 FAMILY = "FQI"
 LOCKSTEP = 4
 _PER_SLOT = ("iterations", "episodes", "epsilon", "evaluate_every")
-#: A step of E evaluated episodes takes as long as fitting 260 + 2 E rows (measured).
-_STEP, _EPISODE = 260, 2
+#: A step of E evaluated episodes takes as long as fitting 150 + 2 E rows (measured).
+_STEP, _EPISODE = 150, 2
 _SHARE = 0.2  # of a run's time that evaluations may take
 
 
