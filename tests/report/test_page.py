@@ -6,6 +6,7 @@ import html
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -14,6 +15,7 @@ from PIL import Image
 
 from bcrl.report.curve_data import curve_data
 from bcrl.report.figures.curves import POINTS, figure_curves, shared_spans, spread_rows
+from bcrl.report.figures.style import task_spans
 from bcrl.report.load import load_runs
 from bcrl.results.layout import DQN_METRICS
 from tests.report.runs import report, write_dqn, write_fqi
@@ -94,6 +96,12 @@ def test_tasks_are_shaded_where_the_curricula_agree(tmp_path):
     write_steps(tmp_path, OWN, "BC-DQN", [1000, 4000], [1, 2])
     methods = load_runs(tmp_path, "smoke").tagged(OWN, "DQN", None)
     assert shared_spans(methods) == []
+
+
+def test_a_task_is_shaded_over_iterations_without_a_row():
+    task, index = np.array([1, 1, 2]), np.array([9, 25, 50])
+    rare = SimpleNamespace(family="FQI", task=task, index=index)
+    assert task_spans(rare) == [("T1", 0.5, 25.5), ("T2", 25.5, 50.5)]
 
 
 def test_long_curves_keep_their_stages_ends(tmp_path):

@@ -68,10 +68,11 @@ def line_of(method: str) -> dict[str, Any]:
 
 def task_spans(variant: Variant) -> list[Span]:
     """Name and extent of a variant's tasks, on the axis of iterations or steps."""
-    task, steps = variant.task, variant.index
-    edges = np.arange(len(task) + 1) + 0.5
-    if variant.family == "DQN":
-        edges = np.append(steps, steps[-1]).astype(float)
+    task, index = variant.task, variant.index
+    if variant.family == "DQN":  # a stage begins with a row
+        edges = np.append(index, index[-1]).astype(float)
+    else:  # and here it ends with one; not every iteration has a row
+        edges = np.append(0, index) + 0.5
     spans = itertools.pairwise([0, *np.flatnonzero(np.diff(task)) + 1, len(task)])
     return [(f"T{task[a]}", edges[a].item(), edges[b].item()) for a, b in spans]
 
