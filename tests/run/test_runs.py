@@ -134,8 +134,8 @@ def test_fqi_is_evaluated_seldom_outside_of_the_paper_and_its_results_are_sound(
     for words in (["env=maze"], ["env=car_on_hill"]):
         learners = [stage.learner for stage in plan(*words, "scale=paper").stages]
         assert {learner.evaluate_every for learner in learners} == {1}
-    # An evaluation of 20 starts may cost 4 · (260 + 2 · 20) = 1200 of the fitted rows.
-    for iterations, episodes, every in ((20, 100, 20), (25, 100, 13), (50, 300, 5)):
+    # An evaluation of 20 starts may cost 4 · (150 + 2 · 20) = 760 of the fitted rows.
+    for iterations, episodes, every in ((20, 100, 10), (25, 100, 9), (50, 300, 3)):
         sizes = f"algorithm.iterations={iterations}", f"algorithm.episodes={episodes}"
         stages = plan("env=mountain_car", *sizes).stages
         assert {stage.learner.evaluate_every for stage in stages} == {every}
