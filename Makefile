@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 SCALE ?= quick
 PYTEST := $(BIN)/python -m pytest
-PIP ?= $(BIN)/python -m pip install --quiet --no-compile
+PIP := $(BIN)/python -m pip install --quiet --no-compile
 WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 
 # Without bytecode each process would compile all of torch again.

@@ -1,6 +1,6 @@
 """Classic control in compiled code, against Gymnasium's own simulators."""
 
-import pickle
+from multiprocessing import Pipe
 
 import numpy as np
 import pytest
@@ -36,8 +36,10 @@ CASES = [
 @exact
 @pytest.mark.parametrize(("name", "changes"), CASES)
 def test_every_bit_is_that_of_gymnasium(name, changes):
-    sent = pickle.dumps(Gymnasium(name, **changes))  # as to a worker process
-    task, rng = pickle.loads(sent), np.random.default_rng(0)
+    here, there = Pipe()  # as to a worker process
+    with here, there:
+        here.send(Gymnasium(name, **changes))
+        task, rng = there.recv(), np.random.default_rng(0)
     lanes, own = task.lanes(), SimulatedLanes(task)
     assert isinstance(lanes, CompiledLanes)
     start = rng.random((2, 8, 1))

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 from bcrl.config.plan import part
 from bcrl.errors import BcrlError
@@ -41,6 +42,14 @@ def test_processes_share_the_seeds_but_on_a_gpu_one_has_as_many_as_may_be(tmp_pa
         for device in ("cpu", "cuda")
     }
     assert sizes == {"cpu": [23, 23, 22, 22], "cuda": [45, 45]}
+
+
+def test_groups_are_larger_on_a_gpu_unless_their_size_is_given(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    words = (*LINEAR, "variant=plain", "device=cuda")
+    own, given = plan(*words), plan(*words, "seeds.lockstep=7")
+    assert (own.lockstep, given.lockstep) == (500, 7)
+    assert plan(*LINEAR, "variant=plain", "device=cpu").lockstep == 20
 
 
 def test_the_parts_of_seeds_are_all_of_them_once():
