@@ -102,8 +102,9 @@ class Launched:
         return found
 
     def begun(self, *but: int) -> int:
-        """A job in the middle of its work that isn't one of these."""
+        """A job, none of these, at its start: one that began may be about to end."""
         jobs = [job for job in range(2 * len(self.plans)) if job not in but]
+        jobs = [job for job in jobs if not self.checkpoints(job)]
         return self.until(lambda: next((j for j in jobs if self.checkpoints(j)), None))
 
     def checkpoints(self, job: int) -> list[Path]:
