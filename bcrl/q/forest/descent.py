@@ -26,9 +26,12 @@ CACHED = 2**19  # keys of the rows that are sorted together: 2 MiB
 
 
 class Descent(NamedTuple):
-    """The rows (m, d) that go down, and memory for their way."""
+    """The rows (m, d) that go down, and memory for their way.
 
-    keys: NDArray[np.int32]  # (m · d,)
+    A row is named by the place where its keys begin: a product less in each node.
+    """
+
+    keys: NDArray[np.int32]  # (m · d,), below 2^32
     d: int
     one: NDArray[np.uint32]  # (m,) each: the rows, sorted from one into the other
     other: NDArray[np.uint32]  # and back
@@ -57,14 +60,21 @@ def planes(descent, depth):
 
 
 @inlined
+def enter(descent, begin, end):
+    """Put the rows begin:end into the root."""
+    for i in range(begin, end):
+        descent.one[i] = np.uint32(i * descent.d)
+
+
+@inlined
 def sort_node(descent, depth, start, stop, feature, cut):
     """Sort a node's rows into its children's plane; returns the left child's end."""
-    keys, width, column = descent.keys, U(descent.d), U(feature)
+    keys, column = descent.keys, U(feature)
     here, there = planes(descent, depth)
     left, right = start, stop - U(1)
     for i in range(start, stop):
         row = here[i]
-        goes_left = U(keys[U(row) * width + column] <= cut)
+        goes_left = U(keys[U(row) + column] <= cut)
         there[left], there[right] = row, row  # the next row corrects one
         left += goes_left
         right -= U(1) - goes_left
@@ -75,15 +85,20 @@ def sort_node(descent, depth, start, stop, feature, cut):
 def _sort_down(nodes, values, root, descent, begin, end, total):
     """Add one tree's predictions to `total`, sorting the rows begin:end down it."""
     stack, node, depth, top = descent.stack, root, 0, 0
-    start, stop = U(begin), U(end)
-    for i in range(start, stop):
-        descent.one[i] = np.uint32(i)
+    keys, width, start, stop = descent.keys, U(descent.d), U(begin), U(end)
+    enter(descent, begin, end)
     while True:
         child, feature, cut = nodes[node].child, nodes[node].feature, nodes[node].cut
         if feature < 0:
             here, _ = planes(descent, depth)
             for i in range(start, stop):
-                total[here[i]] += values[child]
+                total[U(here[i]) // width] += values[child]
+        elif nodes[child].feature & nodes[child + 1].feature < 0:
+            here, _ = planes(descent, depth)  # not sorted: both children are leaves
+            leaf, column = U(nodes[child].child), U(feature)
+            for i in range(start, stop):
+                row = U(here[i])
+                total[row // width] += values[leaf + U(keys[row + column] > cut)]
         else:
             left = sort_node(descent, depth, start, stop, feature, cut)
             depth += 1

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.common.compiling import compiled, kept
-from bcrl.q.forest.descent import new_descent, planes, sort_node
+from bcrl.q.forest.descent import enter, new_descent, planes, sort_node
 from bcrl.q.forest.lanes import LANES, choose_all, load, new_sums, store
 from bcrl.q.forest.split import (
     NODE,
@@ -122,8 +122,7 @@ def _grow_tree(
     n_nodes += 1
     n, m = U(fitted.size), U(queried.size)
     start, stop, q_start, q_stop = U(0), n, U(0), m
-    for i in range(m):
-        queries.one[i] = np.uint32(i)
+    enter(queries, 0, m)
     while True:
         here = _plane(depth) * n
         first, last = here + start, here + stop
@@ -167,7 +166,7 @@ def _grow_tree(
                 fitted[rows.origin[i]] += value
             there, _ = planes(queries, depth)
             for i in range(q_start, q_stop):
-                queried[there[i]] += value
+                queried[U(there[i]) // U(queries.d)] += value
             if keep:
                 nodes[node].cut, nodes[node].feature = 0, -1
                 nodes[node].child = n_values
