@@ -31,7 +31,7 @@ class Descent(NamedTuple):
     A row is named by the place where its keys begin: a product less in each node.
     """
 
-    keys: NDArray[np.int32]  # (m · d,), below 2^32
+    keys: NDArray[np.int32]  # (m · d,), fewer than 2^32
     d: int
     one: NDArray[np.uint32]  # (m,) each: the rows, sorted from one into the other
     other: NDArray[np.uint32]  # and back
@@ -60,9 +60,9 @@ def planes(descent, depth):
 
 
 @inlined
-def enter(descent, begin, end):
-    """Put the rows begin:end into the root."""
-    for i in range(begin, end):
+def enter(descent):
+    """Put all rows into the root."""
+    for i in range(descent.one.size):
         descent.one[i] = np.uint32(i * descent.d)
 
 
@@ -82,19 +82,19 @@ def sort_node(descent, depth, start, stop, feature, cut):
 
 
 @uncounted
-def _sort_down(nodes, values, root, descent, begin, end, total):
-    """Add one tree's predictions to `total`, sorting the rows begin:end down it."""
+def _sort_down(nodes, values, root, descent, total):
+    """Add one tree's predictions to `total`, sorting the rows down it."""
     stack, node, depth, top = descent.stack, root, 0, 0
-    keys, width, start, stop = descent.keys, U(descent.d), U(begin), U(end)
-    enter(descent, begin, end)
+    keys, width, start, stop = descent.keys, U(descent.d), U(0), U(total.size)
+    enter(descent)
     while True:
         child, feature, cut = nodes[node].child, nodes[node].feature, nodes[node].cut
+        here, _ = planes(descent, depth)
         if feature < 0:
-            here, _ = planes(descent, depth)
             for i in range(start, stop):
                 total[U(here[i]) // width] += values[child]
         elif nodes[child].feature & nodes[child + 1].feature < 0:
-            here, _ = planes(descent, depth)  # not sorted: both children are leaves
+            # Both children are leaves: no need to sort.
             leaf, column = U(nodes[child].child), U(feature)
             for i in range(start, stop):
                 row = U(here[i])
@@ -193,14 +193,15 @@ def predict_addressed(table):
         nodes = carray(pointer(row[0]), (size,), NODE)
         values = carray(pointer(row[1]), ((size + trees) // 2,), np.float64)
         total = np.zeros(m)
-        descent = new_descent(carray(pointer(row[3]), (m, d), np.float32))
+        x = carray(pointer(row[3]), (m, d), np.float32)
         if m >= TOGETHER + size // trees // SHARE:
             part = max(1, CACHED // d)
             for begin in range(0, m, part):
+                some, own = x[begin : begin + part], total[begin : begin + part]
+                descent = new_descent(some)
                 for t in range(trees):
-                    end = min(m, begin + part)
-                    _sort_down(nodes, values, first[t], descent, begin, end, total)
+                    _sort_down(nodes, values, first[t], descent, own)
         elif m > 0:
-            _walk_down(nodes, values, first, descent, total)
+            _walk_down(nodes, values, first, new_descent(x), total)
         found.append(total / trees)
     return found

@@ -66,6 +66,8 @@ class Regression:
                 raise BcrlError(f"multiplicity must be ({len(x)},) {why}")
         given = x[:0] if self.queries is None else self.queries
         self.queries = _points("queries", given, x.shape[1])
+        if (size := self.queries.size) >= 2**32:
+            raise BcrlError(f"queries has {size} numbers, expected fewer than 2^32")
 
 
 @dataclass(frozen=True)
@@ -199,8 +201,6 @@ def _points(name: str, x: np.ndarray, d: int | None = None) -> np.ndarray:
     x = np.ascontiguousarray(x, np.float32)
     if x.ndim != 2 or x.shape[1] < 1 or (d or x.shape[1]) != x.shape[1]:
         raise BcrlError(f"{name} has shape {x.shape}, not (rows, {d or 'features'})")
-    if x.size >= 2**32:
-        raise BcrlError(f"{name} has {x.size} numbers, expected fewer than 2^32")
     if not np.isfinite(x).all():
         raise BcrlError(f"{name} holds NaN, infinity or values too large for float32")
     return x

@@ -122,7 +122,7 @@ def _grow_tree(
     n_nodes += 1
     n, m = U(fitted.size), U(queried.size)
     start, stop, q_start, q_stop = U(0), n, U(0), m
-    enter(queries, 0, m)
+    enter(queries)
     while True:
         here = _plane(depth) * n
         first, last = here + start, here + stop
