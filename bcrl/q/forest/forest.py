@@ -66,8 +66,11 @@ class Regression:
                 raise BcrlError(f"multiplicity must be ({len(x)},) {why}")
         given = x[:0] if self.queries is None else self.queries
         self.queries = _points("queries", given, x.shape[1])
-        if (size := self.queries.size) >= 2**32:
-            raise BcrlError(f"queries has {size} numbers, expected fewer than 2^32")
+        most = 2 ** (32 - (x.shape[1] - 1).bit_length()) - 1
+        if len(self.queries) > most:
+            raise BcrlError(
+                f"queries has {len(given)} rows, at most {most} are allowed"
+            )
 
 
 @dataclass(frozen=True)

@@ -166,7 +166,7 @@ def _grow_tree(
                 fitted[rows.origin[i]] += value
             there, _ = planes(queries, depth)
             for i in range(q_start, q_stop):
-                queried[U(there[i]) // U(queries.d)] += value
+                queried[U(there[i]) >> queries.shift] += value
             if keep:
                 nodes[node].cut, nodes[node].feature = 0, -1
                 nodes[node].child = n_values
