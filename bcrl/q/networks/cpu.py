@@ -57,12 +57,13 @@ def _relu(units, n_units, n, alive):
     """Put a layer's units through a ReLU; list those on in some column, count them."""
     on, zero = 0, np.float32(0.0)
     for k in range(n_units):
-        most = zero
+        some = 0  # integers, unlike floats, are taken together in vectors
         for b in range(n):
-            units[k, b] = max(zero, units[k, b])
-            most = max(most, units[k, b])
+            positive = units[k, b] > zero
+            some |= int(positive)
+            units[k, b] = units[k, b] if positive else zero
         alive[on] = k
-        on += int(most > zero)
+        on += some
     return on
 
 
