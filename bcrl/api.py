@@ -34,10 +34,11 @@ from bcrl.q.regressors.ours import ForestRegressor as Forest
 from bcrl.q.regressors.ours import Tabular
 from bcrl.q.regressors.scikit import Sklearn
 from bcrl.results.tables import read_folder as read
+from bcrl.run.agents import load
 from bcrl.run.workers import cores
 
 __all__ = ["CarOnHill", "Gymnasium", "LinearSystem", "Maze", "compiled_step"]
-__all__ += ["read", "run", "stages"]
+__all__ += ["load", "read", "run", "stages"]
 __all__ += ["DQN", "FQI", "LSPI", "Forest", "Sklearn", "Tabular"]
 __all__ += ["Boost", "PolicyReuse", "ResidualPolicy", "Shape", "warm_start"]
 

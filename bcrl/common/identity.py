@@ -7,7 +7,7 @@ Plain = dict[str, Any]  # a resolved config: dicts, lists and scalars
 
 #: Top-level keys that change no number, but for another device's rounding.
 OUTPUT_KEYS = ("seeds", "workers", "threads", "device", "runs_dir", "tag", "progress")
-OUTPUT_KEYS += ("strict", "checkpoint_every", "logger")
+OUTPUT_KEYS += ("strict", "checkpoint_every", "logger", "keep", "extend")
 
 
 def identity(config: Plain) -> Plain:

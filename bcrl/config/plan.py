@@ -19,6 +19,7 @@ from bcrl.learning.stage import Stage
 from bcrl.learning.transfer import PolicyReuse, ResidualPolicy, Shape
 from bcrl.results.loggers import logger
 
+KEEP = ("none", "final", "stages", "state")  # of what a complete seed has learned
 LOCKSTEP_ON_GPU = 500  # seeds: a step takes little longer than that of 100
 
 
@@ -159,6 +160,7 @@ def _check_outputs(config: Plain, tag: str | None) -> None:
         check_numbers(section, {k: v for k, v in values.items() if v is not None})
     logger(config["logger"])
     one_of("progress", config["progress"], ["auto", "bar", "lines", "none"])
+    one_of("keep", config["keep"], KEEP)
     check_path("runs_dir", config["runs_dir"])
     check_name("scale.name", config["scale"]["name"])
     if tag is not None:

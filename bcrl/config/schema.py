@@ -19,7 +19,15 @@ VARIANT_GROUPS = ("env", "algorithm", "curriculum", "boosting", "transfer", "sca
 _OF_SLURM = get_type_hints(SlurmQueueConf).items()
 #: The keys whose values are text, those of Slurm's launcher among them.
 TEXTS = {f"hydra.launcher.{k}" for k, hint in _OF_SLURM if hint in (str, str | None)}
-TEXTS |= {"curriculum.name", "device", "progress", "runs_dir", "scale.name"}
+TEXTS |= {
+    "curriculum.name",
+    "device",
+    "extend",
+    "keep",
+    "progress",
+    "runs_dir",
+    "scale.name",
+}
 TEXTS |= {"seeds.part", "tag"}
 
 
@@ -71,6 +79,8 @@ class Config:
     strict: bool = False
     logger: Any = field(default_factory=lambda: {"name": "none"})
     checkpoint_every: float = 60.0
+    keep: str = "final"
+    extend: str | None = None
 
 
 def section_of_seeds(key: str, value: object) -> dict[str, Any]:

@@ -99,6 +99,7 @@ class CurriculumRun:
     stages: Sequence[Stage]
     batch: SeedBatch
     state: RunState = RunState(0, None)  # with the latest pause's a new run resumes
+    ending: RunState | None = None  # from it, a run whose last stage is longer resumes
 
     def __iter__(self) -> Iterator[Pause]:
         for stage in self.stages[self.state.stages :]:
@@ -107,6 +108,8 @@ class CurriculumRun:
             for pause in learner.learn(stage, start, self.batch, now.state):
                 if isinstance(pause, Snapshot) and pause.last_of_stage:
                     self.state = RunState(stage.number, pause.result)
+                    if stage is self.stages[-1]:
+                        self.ending = RunState(now.stages, now.result, pause.state)
                 else:
                     self.state = RunState(now.stages, now.result, pause.state)
                 yield pause

@@ -1,13 +1,14 @@
 """Action-value functions of several seeds at once, and sums of them."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import reduce
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.common.seed_axis import seeds_on
 from bcrl.common.serialization import storable
 from bcrl.envs import FiniteEnv
 from bcrl.errors import BcrlError, LostSeeds
@@ -163,7 +164,7 @@ def memoized(q: Q) -> Q:
 class Table:
     """The Q-table of a finite environment, one array (N, A) per seed."""
 
-    values: Sequence[NDArray[np.float64]]
+    values: Sequence[NDArray[np.float64]] = field(metadata=seeds_on(0))
     env: FiniteEnv
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
