@@ -1,5 +1,6 @@
 """Boosted Curriculum Reinforcement Learning (Klink et al., ICLR 2022), reproduced."""
 
+import importlib as _importlib
 import os as _os
 import signal as _signal
 import sys as _sys
@@ -11,12 +12,13 @@ from bcrl.common import registration as _registration  # noqa: F401
 __version__ = "0.1.0"
 
 
-def __getattr__(name: str) -> _Any:
-    """`bcrl.load`, whose imports take a second."""
-    if name == "load":
-        from bcrl.run.agents import load
+_LATER = {"load": "bcrl.run.agents", "export": "bcrl.learning.export"}
 
-        return load
+
+def __getattr__(name: str) -> _Any:
+    """`bcrl.load` and `bcrl.export`, whose imports take a second."""
+    if name in _LATER:
+        return getattr(_importlib.import_module(_LATER[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

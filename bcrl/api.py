@@ -26,6 +26,7 @@ from bcrl.errors import BcrlError, ConfigError
 from bcrl.evaluation import metrics as fqi_metrics
 from bcrl.evaluation.step_metrics import StepProbe
 from bcrl.learning.dqn import DQN
+from bcrl.learning.export import export
 from bcrl.learning.fqi import FQI
 from bcrl.learning.lspi import LSPI
 from bcrl.learning.stage import Learner, SeedBatch, Stage, Transfer, learn
@@ -38,7 +39,7 @@ from bcrl.run.agents import load
 from bcrl.run.workers import cores
 
 __all__ = ["CarOnHill", "Gymnasium", "LinearSystem", "Maze", "compiled_step"]
-__all__ += ["load", "read", "run", "stages"]
+__all__ += ["export", "load", "read", "run", "stages"]
 __all__ += ["DQN", "FQI", "LSPI", "Forest", "Sklearn", "Tabular"]
 __all__ += ["Boost", "PolicyReuse", "ResidualPolicy", "Shape", "warm_start"]
 

@@ -1,9 +1,7 @@
 """What one seed has learned, as an agent that values and chooses actions."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
+from functools import cached_property, partial
 from typing import Any
 
 import gymnasium
@@ -12,37 +10,14 @@ from gymnasium import spaces
 from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
-from bcrl.common.seed_axis import of_seed
-from bcrl.common.serialization import storable
 from bcrl.envs import Env, is_simulated
 from bcrl.envs.gym_api import GymEnv
 from bcrl.errors import BcrlError
 from bcrl.learning import Floats, Integers
+from bcrl.learning.learned import Learned
 from bcrl.learning.policies import combined_actions, greedy
-from bcrl.learning.stage import SeedBatch, Stage
-from bcrl.learning.transfer import Acting, StageResult
+from bcrl.learning.transfer import Acting
 from bcrl.q.functions import ZERO, Q
-
-
-@storable
-@dataclass(frozen=True)
-class Learned:
-    """The Q-functions of one seed at the end of a run."""
-
-    result: StageResult  # of the last stage, without its data
-    residuals: tuple[Q, ...]  # ϱ of each stage that was kept, the last one's last
-
-
-def learned(result: StageResult, residuals: Sequence[Q], s: int) -> Learned:
-    """The part of the seed with index s in what a batch of seeds has learned."""
-    own = StageResult(result.q, result.residual, acting=result.acting)
-    return of_seed(Learned(own, tuple(residuals)), s)
-
-
-def given(stages: Sequence[Stage], batch: SeedBatch) -> list[Any]:
-    """What a stored `Learned` refers to and does not contain, in a fixed order."""
-    regressors = (getattr(stage.learner, "regressor", None) for stage in stages)
-    return [ZERO, batch, *(stage.env for stage in stages), *regressors]
 
 
 @dataclass(frozen=True)
@@ -65,7 +40,12 @@ class Agent:
 
     def values(self, q: Q, observations: Any) -> Floats:
         """The values (n, A) of a Q-function of one seed at n observations."""
-        return np.asarray(q(self.states(observations)[None], self.task.n_actions)[0])
+        return self._values(q, self.states(observations)[None])[0]
+
+    def _values(self, q: Q, states: Floats) -> Floats:
+        """Values (1, n, A) at states (1, n, d)."""
+        stacked: Any = states  # of one seed
+        return np.asarray(q(stacked, self.task.n_actions))
 
     def act(self, observation: Any, rng: np.random.Generator | None = None) -> Any:
         """The greedy action, as Gymnasium counts it; an array (n,) at n observations.
@@ -80,29 +60,22 @@ class Agent:
 
     def choose(self, states: Floats, u: Floats, alive: Any = None) -> Integers:
         """A `Policy`: greedy actions (1, n) at states (1, n, d) by uniforms u."""
-        acting, n_actions = self.learned.result.acting, self.task.n_actions
+        acting = self.learned.result.acting
         if acting is None:
             acting = Acting(self.learned.result.q, np.zeros(1, bool))
-        own = greedy(np.asarray(acting.own(states, n_actions)), u[..., 1])
+        own = greedy(self._values(acting.own, states), u[..., 1])
         if acting.prior is ZERO:
             return own
-        advised = greedy(np.asarray(acting.prior(states, n_actions)), u[..., 2])
+        advised = greedy(self._values(acting.prior, states), u[..., 2])
         own = np.where(acting.copying[:, None], advised, own)
         return combined_actions(self.task.actions)[advised, own]
 
-    def export(self, path: str | Path) -> Path:
-        """Write Q and the greedy policy for other programs: .onnx or .npz."""
-        from bcrl.learning.export import export
-
-        return export(self, path)
-
     def make(self, render_mode: str | None = None) -> gymnasium.Env:
         """A new Gymnasium environment of the task, cut after its horizon."""
-        if is_simulated(self.task):
-            env = self.task.recipe.make(render_mode)
-        else:
-            env = GymEnv(self.task, render_mode)
-        return gymnasium.wrappers.TimeLimit(env, self.task.horizon)
+        task: Any = self.task
+        simulated = is_simulated(task)
+        make = task.recipe.make if simulated else partial(GymEnv, task)
+        return gymnasium.wrappers.TimeLimit(make(render_mode), task.horizon)
 
     def states(self, observations: Any) -> Floats:
         """Observations of the task's Gymnasium environment as vectors (n, d)."""
@@ -125,7 +98,8 @@ class Agent:
         """An open simulator, which knows the spaces; None of a pure environment."""
         if not is_simulated(self.task):
             return None
-        simulator = self.task.simulator()
+        task: Any = self.task
+        simulator = task.simulator()
         simulator.open()
         return simulator
 

@@ -49,7 +49,7 @@ def layers_of(q: Q) -> list[tuple[NDArray, NDArray]]:
 
 def _npz(agent: Agent) -> bytes:
     """Arrays, and the JSON text `about` that says how Q is made of them."""
-    arrays: dict[str, NDArray] = {}
+    arrays: dict[str, Any] = {}
     labels = iter(range(10**9))
 
     def put(kind: str, **parts: NDArray) -> dict[str, Any]:
@@ -74,8 +74,8 @@ def _described(q: Q, put: Put) -> Any:
     if isinstance(q, Table):
         return put("table", states=q.env.states(), values=np.asarray(q.values[0]))
     if isinstance(q, Quadratic):
-        parts = {"matrix": q.matrix[0], "linear": q.linear[0], "actions": q.actions}
-        return put("quadratic", **parts)
+        own = {"matrix": q.matrix[0], "linear": q.linear[0], "actions": q.actions}
+        return put("quadratic", **own)
     if isinstance(q, FittedQ):
         q.refit()
         models = [None if fitted is None else fitted.model for fitted in q.models[0]]
@@ -83,8 +83,8 @@ def _described(q: Q, put: Put) -> Any:
             "actions": [model and put("forest", **_trees(model)) for model in models]
         }
     named = enumerate(layers_of(q))
-    parts = {f"{'wb'[i]}{k}": x for k, layer in named for i, x in enumerate(layer)}
-    return put("network", **parts)
+    flat = {f"{'wb'[i]}{k}": x for k, layer in named for i, x in enumerate(layer)}
+    return put("network", **flat)
 
 
 def _trees(model: Any) -> dict[str, NDArray]:

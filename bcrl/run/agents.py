@@ -1,8 +1,8 @@
-"""Agents: what complete seeds have learned, in files beside their results."""
+"""Loading agents, which complete seeds have left beside their results."""
 
 import re
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,27 +12,16 @@ from bcrl import __version__
 from bcrl.common import plugins, serialization
 from bcrl.config.plan import Plan, plan
 from bcrl.errors import BcrlError, ConfigError
-from bcrl.learning.agent import Agent, Learned, given, learned
+from bcrl.learning.agent import Agent
+from bcrl.learning.learned import AGENT_SCHEMA, Learned, given
 from bcrl.learning.stage import SeedBatch
-from bcrl.learning.transfer import StageResult
-from bcrl.q.functions import Q
 from bcrl.results.layout import AGENT, COMPLETE, recorded_seeds, seed_path, spelled
 from bcrl.results.read import read_arrays, read_document, read_recorded
 from bcrl.run.memory import available
 from bcrl.run.workers import cores
 
-_SCHEMA = 1  # raised when the content's meaning changes
 _NEAR = 1e-3  # share of Q's size that another processor's rounding may change
 _PER_BYTE = 2  # bytes of a tree per byte of the rows that it is fitted to again
-
-
-def packed(
-    plan: Plan, batch: SeedBatch, result: StageResult, residuals: Sequence[Q], s: int
-) -> bytes:
-    """The file of the seed with index s; TypeError if a Q-function can't be stored."""
-    about = {"schema": _SCHEMA, "bcrl": __version__, "seed": batch.seeds[s]}
-    own = learned(result, residuals, s)
-    return serialization.written(about, own, given(plan.stages, batch))
 
 
 def load(run: str | Path, seed: int = 0, *, trust: str | Iterable[str] = ()) -> Agent:
@@ -50,15 +39,19 @@ def load(run: str | Path, seed: int = 0, *, trust: str | Iterable[str] = ()) -> 
         todo = f"delete {path.with_suffix('')}.* and run again with keep=final"
         raise BcrlError(f"{path} is missing: {why}; {todo}")
     size = len(read_recorded(path, document))
-    if (about := serialization.read_about(path)).get("schema") != _SCHEMA:
+    if (about := serialization.read_about(path)).get("schema") != AGENT_SCHEMA:
         made = f"has schema {about.get('schema')!r} of bcrl {about.get('bcrl')}"
-        raise BcrlError(f"{path} {made}; bcrl {__version__} reads schema {_SCHEMA}")
+        raise BcrlError(
+            f"{path} {made}; bcrl {__version__} reads schema {AGENT_SCHEMA}"
+        )
     made = _plan(path, document, [trust] if isinstance(trust, str) else trust)
     regressors = (getattr(stage.learner, "regressor", None) for stage in made.stages)
     trees = max(getattr(regressor, "trees", 0) for regressor in regressors)
     if (needed := _PER_BYTE * size * trees) > (there := available()):
         what = f"{path} needs up to {needed / 2**30:.0f} GiB of memory for its trees"
         raise BcrlError(f"{what}, but there are {there / 2**30:.0f}")
+    if made.family == "DQN":  # FQI does without torch, which is slow to import
+        from bcrl.q.networks import mlp  # noqa: F401 (a file holds its classes)
     batch = SeedBatch((seed,), np.empty((0, made.target.state_dim)), cores())
     own = serialization.read_content(path, given(made.stages, batch))
     if not isinstance(own, Learned):

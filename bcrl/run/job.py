@@ -19,12 +19,13 @@ from bcrl.common.terminal import say
 from bcrl.errors import BcrlError
 from bcrl.evaluation.metrics import Probe
 from bcrl.evaluation.step_metrics import StepProbe
+from bcrl.learning.learned import packed
 from bcrl.learning.rollout import success_of
 from bcrl.learning.stage import CurriculumRun, RunState, SeedBatch, Snapshot
 from bcrl.q.functions import Q
 from bcrl.results import loggers
 from bcrl.results.layout import COMPLETE, RUNNING
-from bcrl.run import agents, checkpoints, extension, locks, records
+from bcrl.run import checkpoints, extension, locks, records
 from bcrl.run.progress import Tick
 from bcrl.run.schedule import Job
 
@@ -200,8 +201,9 @@ class _Training:
         if self.plan.config["keep"] == "none" or result is None:
             return None, {"no_agent": "its run had keep=none"}
         try:
-            batch = self.run.batch
-            return agents.packed(self.plan, batch, result, self.residuals, place), {}
+            stages = self.plan.stages
+            own = stages, self.run.batch, result, self.residuals, place
+            return packed(*own), {}
         except TypeError as error:  # of a user's own class
             return None, {"no_agent": f"{error}: mark the class @storable"}
 

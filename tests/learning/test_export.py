@@ -75,7 +75,7 @@ def forest(about, arrays, x):
 @pytest.mark.parametrize("kind", [*NETWORKS, *OTHERS])
 def test_the_npz_is_all_that_another_program_needs(kind, tmp_path):
     agent = bcrl.load(run(tmp_path, *KINDS[kind]).directory)
-    with np.load(agent.export(tmp_path / "agent.npz")) as stored:
+    with np.load(bcrl.export(agent, tmp_path / "agent.npz")) as stored:
         arrays = dict(stored)
     about, x = json.loads(str(arrays["about"])), states_of(agent)
     expected = agent.q(x)
@@ -90,7 +90,7 @@ def test_onnxruntime_computes_the_same(kind, tmp_path):
     import onnxruntime
 
     agent = bcrl.load(run(tmp_path, *KINDS[kind]).directory)
-    path, x = agent.export(tmp_path / "agent.onnx"), states_of(agent)
+    path, x = bcrl.export(agent, tmp_path / "agent.onnx"), states_of(agent)
     session = onnxruntime.InferenceSession(str(path))
     q, action = session.run(["q", "action"], {"observation": x})
     expected = agent.q(x)
@@ -106,4 +106,4 @@ def test_what_cant_be_exported_is_refused(tmp_path):
         ("b/a.npz", "no"),
     ):
         with pytest.raises(BcrlError, match=why):
-            agent.export(tmp_path / path)
+            bcrl.export(agent, tmp_path / path)

@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 import pytest
 
@@ -16,7 +15,7 @@ from bcrl.envs import is_finite
 from bcrl.errors import BcrlError
 from bcrl.learning.rollout import CHOICES, play, starts_and_draws
 from bcrl.results.layout import seed_path
-from bcrl.run import agents, evaluate
+from bcrl.run import evaluate, job
 from tests.run.runs import KINDS, MAZE, about, rows, run
 
 FAST = ("maze BC", "maze C", "car_on_hill BC", "dqn SBC_released", "dqn RPL")
@@ -30,13 +29,13 @@ ALL = [
 @pytest.fixture
 def results(monkeypatch):
     """The results of the latest run's last stage, by seed."""
-    found, write = {}, agents.packed
+    found, write = {}, job.packed
 
-    def noted(plan, batch, result, residuals, s):
+    def noted(stages, batch, result, residuals, s):
         found[batch.seeds[s]] = result, s, len(batch.seeds)
-        return write(plan, batch, result, residuals, s)
+        return write(stages, batch, result, residuals, s)
 
-    monkeypatch.setattr(agents, "packed", noted)
+    monkeypatch.setattr(job, "packed", noted)
     return found
 
 
@@ -93,7 +92,7 @@ def test_an_agent_acts_in_a_fresh_process_in_gymnasiums_loop(tmp_path):
     command = [sys.executable, "-c", program, str(made.directory)]
     values, *actions = subprocess.check_output(command, text=True).split()
     agent = bcrl.load(made.directory, seed=1)
-    env, seen = gymnasium.make("CartPole-v1"), []
+    env, seen = agent.make(), []
     seen.append(env.reset(seed=5)[0])
     for action in actions:
         seen.append(env.step(int(action))[0])
