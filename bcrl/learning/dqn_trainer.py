@@ -209,7 +209,7 @@ class DQNTrainer:
             lost = np.flatnonzero(~finite).tolist()
             failed |= dict.fromkeys(lost, f"non-finite {part}")
         loss = now.loss / now.updates if now.updates else now.loss + np.nan
-        if due:  # a longer run goes on from the state at the end
+        if due:  # a longer run continues from the state at the end
             now.loss, now.updates = np.zeros_like(loss), 0
         q = self.start.total(now.deep)
         result = StageResult(q, now.deep, acting=self._acting())

@@ -28,7 +28,7 @@ def load(run: str | Path, seed: int = 0, *, trust: str | Iterable[str] = ()) -> 
     """The agent that a complete seed of a run has left: bcrl.load("runs/…", seed=0).
 
     run: the folder of a variant, `<runs_dir>/<scale>/<env>/<variant>[@tag]`.
-    trust: packages of your own that the run's config names, and that may be imported.
+    trust: your packages that the run's config names, and that may be imported.
     Raises BcrlError if there is no such agent, or its file is not what the run wrote.
     """
     folder = Path(run).absolute()

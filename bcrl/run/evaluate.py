@@ -87,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Console entry point; 2 for bad input."""
     ready()
     try:
-        _evaluate(_parser().parse_args(arguments))
+        _evaluate(_parser().parse_intermixed_args(arguments))
     except BcrlError as error:
         say(f"bcrl-eval: {error}")
         return 2

@@ -1,4 +1,4 @@
-"""A longer run goes on from the end of a shorter one: its kept states (`keep=state`).
+"""A longer run continues a shorter one from its kept states (`keep=state`).
 
 A state is a checkpoint of a complete run. It becomes a checkpoint of the longer run,
 which then resumes as after an interruption.
@@ -18,7 +18,7 @@ from bcrl.results.layout import STATE, recorded_seeds, spelled
 from bcrl.results.read import read_document
 from bcrl.run import checkpoints, records
 
-#: Learners of which more is asked by a setting: its name.
+#: Learner → the setting that makes it learn longer.
 _LENGTHS = {"fqi": "iterations", "dqn": "steps"}
 
 
