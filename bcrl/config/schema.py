@@ -60,6 +60,14 @@ class Choice:
 
 
 @dataclass
+class Start:
+    """The run whose agents the first stage starts from."""
+
+    observation: str | None = None
+    run: Any = None  # its environment's name, tag and config, read from its folder
+
+
+@dataclass
 class Config:
     """What `conf/` composes; sections of type Any are checked by their own classes."""
 
@@ -79,6 +87,7 @@ class Config:
     strict: bool = False
     logger: Any = field(default_factory=lambda: {"name": "none"})
     checkpoint_every: float = 60.0
+    start: Any = field(default_factory=lambda: {"from": None, "observation": None})
     keep: str = "final"
     extend: str | None = None
 

@@ -3,11 +3,12 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.common import plugins
 from bcrl.common.seed_axis import seeds_on
 from bcrl.common.serialization import storable
 from bcrl.envs import FiniteEnv
@@ -108,6 +109,22 @@ class Sum:
         if isinstance(states, np.ndarray):
             return reduce(np.add, values)
         return [reduce(np.add, own) for own in zip(*values, strict=True)]
+
+
+@storable
+@dataclass(frozen=True)
+class Mapped:
+    """A Q-function of other observations: q(observation(s)), state by state."""
+
+    q: Q
+    observation: str  # the function, module.function
+
+    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        key, name = "start.observation", self.observation
+        of = plugins.attribute(key, name, name)
+        seen = [np.array([of(state) for state in x], np.float64) for x in states]
+        given: Any = np.stack(seen) if isinstance(states, np.ndarray) else seen
+        return self.q(given, n_actions)
 
 
 @storable

@@ -9,19 +9,17 @@ from typing import Any
 import numpy as np
 
 from bcrl import __version__
-from bcrl.common import plugins, serialization
+from bcrl.common import plugins
 from bcrl.config.plan import Plan, plan
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.learning.agent import Agent
-from bcrl.learning.learned import AGENT_SCHEMA, Learned, given
 from bcrl.learning.stage import SeedBatch
-from bcrl.results.layout import AGENT, COMPLETE, recorded_seeds, seed_path, spelled
-from bcrl.results.read import read_arrays, read_document, read_recorded
-from bcrl.run.memory import available
+from bcrl.results.layout import AGENT, seed_path
+from bcrl.results.read import read_arrays, read_recorded
+from bcrl.run.agent_files import document_of, read_agent
 from bcrl.run.workers import cores
 
 _NEAR = 1e-3  # share of Q's size that another processor's rounding may change
-_PER_BYTE = 2  # bytes of a tree per byte of the rows that it is fitted to again
 
 
 def load(run: str | Path, seed: int = 0, *, trust: str | Iterable[str] = ()) -> Agent:
@@ -32,52 +30,16 @@ def load(run: str | Path, seed: int = 0, *, trust: str | Iterable[str] = ()) -> 
     Raises BcrlError if there is no such agent, or its file is not what the run wrote.
     """
     folder = Path(run).absolute()
-    document = _document(folder, seed)
-    path = seed_path(folder, seed, AGENT)
-    if not path.exists():
-        why = document.get("no_agent", "its run had keep=none, or it was removed")
-        todo = f"delete {path.with_suffix('')}.* and run again with keep=final"
-        raise BcrlError(f"{path} is missing: {why}; {todo}")
-    size = len(read_recorded(path, document))
-    if (about := serialization.read_about(path)).get("schema") != AGENT_SCHEMA:
-        made = f"has schema {about.get('schema')!r} of bcrl {about.get('bcrl')}"
-        raise BcrlError(
-            f"{path} {made}; bcrl {__version__} reads schema {AGENT_SCHEMA}"
-        )
-    made = _plan(path, document, [trust] if isinstance(trust, str) else trust)
-    regressors = (getattr(stage.learner, "regressor", None) for stage in made.stages)
-    trees = max(getattr(regressor, "trees", 0) for regressor in regressors)
-    if (needed := _PER_BYTE * size * trees) > (there := available()):
-        what = f"{path} needs up to {needed / 2**30:.0f} GiB of memory for its trees"
-        raise BcrlError(f"{what}, but there are {there / 2**30:.0f}")
-    if made.family == "DQN":  # FQI does without torch, which is slow to import
-        from bcrl.q.networks import mlp  # noqa: F401 (a file holds its classes)
+    document = document_of(folder, seed)
+    made = _plan(folder, document, [trust] if isinstance(trust, str) else trust)
     batch = SeedBatch((seed,), np.empty((0, made.target.state_dim)), cores())
-    own = serialization.read_content(path, given(made.stages, batch))
-    if not isinstance(own, Learned):
-        raise BcrlError(f"{path} holds no agent; remove it")
-    agent = Agent(made.target, document["config"], seed, own)
+    learned = read_agent(folder, seed, document, made, batch)
+    agent = Agent(made.target, document["config"], seed, learned)
     _compare(agent, seed_path(folder, seed, "npz"), document)
     return agent
 
 
-def _document(folder: Path, seed: int) -> dict[str, Any]:
-    """A complete seed's JSON; BcrlError says which seeds there are."""
-    if not folder.is_dir():
-        why = "is no folder; name one such as runs/quick/maze/BC-FQI"
-        raise BcrlError(f"{folder} {why}")
-    seeds = recorded_seeds(folder, "json")
-    if seed not in seeds:
-        there = f"seeds {spelled(seeds)}" if seeds else "no seeds"
-        raise BcrlError(f"{folder} has no seed {seed}; there are {there}")
-    document = read_document(folder, seed)
-    if document["status"] != COMPLETE:
-        why = f'says "{document["status"]}"; run its command to the end'
-        raise BcrlError(f"{seed_path(folder, seed, 'json')} {why}")
-    return document
-
-
-def _plan(path: Path, document: dict[str, Any], trust: Iterable[str]) -> Plan:
+def _plan(folder: Path, document: dict[str, Any], trust: Iterable[str]) -> Plan:
     """The plan of the run that wrote a seed's JSON."""
     config = document["config"]
     for name in trust:
@@ -91,7 +53,7 @@ def _plan(path: Path, document: dict[str, Any], trust: Iterable[str]) -> Plan:
             package = re.split("[.:]", named[error.key])[0]
             what = f"its config names code, {error.key}={named[error.key]}; "
             what += f"trust={package!r} lets it be imported"
-        raise BcrlError(f"{path}: {what}") from error
+        raise BcrlError(f"{folder}: {what}") from error
 
 
 def _compare(agent: Agent, npz: Path, document: dict[str, Any]) -> None:

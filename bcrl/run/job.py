@@ -25,7 +25,7 @@ from bcrl.learning.stage import CurriculumRun, RunState, SeedBatch, Snapshot
 from bcrl.q.functions import Q
 from bcrl.results import loggers
 from bcrl.results.layout import COMPLETE, RUNNING
-from bcrl.run import checkpoints, extension, locks, records
+from bcrl.run import agent_files, checkpoints, extension, locks, records
 from bcrl.run.progress import Tick
 from bcrl.run.schedule import Job
 
@@ -92,7 +92,9 @@ class _Training:
         self.probe: Probe | StepProbe
         self.probe = StepProbe(*common) if dqn else Probe(*common, plan.metrics)
         batch = SeedBatch(seeds, self.probe.states, job.threads, plan.device)
-        self.run = CurriculumRun(plan.stages, batch)
+        earlier = plan.source.all_stages if plan.source else ()
+        begun = RunState(0, None if job.resumes else agent_files.start(plan, batch))
+        self.run = CurriculumRun(plan.stages, batch, begun, earlier=earlier)
         self.rows: list[list[dict[str, Any]]] = [[] for _ in seeds]  # of the CSVs
         self.residuals: list[Q] = []  # ϱ of the stages that an agent keeps
         self.failed: dict[int, str] = {}  # by place in the batch
@@ -101,7 +103,7 @@ class _Training:
         self._path = checkpoints.checkpoint_path(plan, seeds)
         if job.resumes:
             stored = read_content(self._path, self.run.given, plan.device)
-            self.run = CurriculumRun(plan.stages, batch, stored["past"])
+            self.run.state = stored["past"]
             self.probe.kept, self.failed = stored["kept"], stored["failed"]
             self.residuals = stored["residuals"]
             self.rows, self.interruptions = json.loads(stored["rows"]), stored["stops"]
@@ -201,7 +203,7 @@ class _Training:
         if self.plan.config["keep"] == "none" or result is None:
             return None, {"no_agent": "its run had keep=none"}
         try:
-            stages = self.plan.stages
+            stages = self.plan.all_stages
             own = stages, self.run.batch, result, self.residuals, place
             return packed(*own), {}
         except TypeError as error:  # of a user's own class
