@@ -5,6 +5,7 @@ these come back: reading a file runs none of its content.
 """
 
 import dataclasses
+import importlib
 import io
 import json
 import math
@@ -23,6 +24,7 @@ from bcrl.errors import BcrlError
 #: Metadata of a dataclass's field that isn't stored: it follows from the others.
 DERIVED = {"derived": True}
 _STORABLE: dict[str, type] = {}
+_OURS = ("bcrl.envs.", "bcrl.learning.", "bcrl.q.")  # where storable classes are
 _PLAIN = (type(None), bool, int, float, str)
 
 
@@ -45,6 +47,13 @@ def is_derived(field: dataclasses.Field) -> bool:
 def _name(cls: type) -> str:
     """A class's name in a file, with its module: a user's `Sum` is not ours."""
     return f"{cls.__module__}.{cls.__qualname__}"
+
+
+def _class(name: str) -> type:
+    """The storable class of a name; of our classes, the module is imported."""
+    if name not in _STORABLE and name.startswith(_OURS):  # networks import torch
+        importlib.import_module(name.rpartition(".")[0])
+    return _STORABLE[name]
 
 
 def _fields(cls: type) -> list[str]:
@@ -181,9 +190,9 @@ class _Unpacker:
             whole = whole if kind == "list" else tuple(whole)
         elif kind == "dict":
             whole = {self.unpack(k): self.unpack(v) for k, v in parts}
-        elif kind == "object" and parts[1].keys() == set(_fields(_STORABLE[parts[0]])):
+        elif kind == "object" and parts[1].keys() == set(_fields(_class(parts[0]))):
             fields = {key: self.unpack(value) for key, value in parts[1].items()}
-            whole = _STORABLE[parts[0]](**fields)
+            whole = _class(parts[0])(**fields)
         else:
             raise ValueError(f"this version knows no such {kind}")
         self.made.append(whole)

@@ -88,7 +88,8 @@ def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
     tasks, metrics = _tasks(config["env"])
     module = algorithm(str(config["algorithm"].get("name")))
     source = _source(config, tasks)
-    chosen = composition(config, tasks, _past(source) if source else None)
+    mapped = bool(config["start"].get("observation"))
+    chosen = composition(config, tasks, _past(source, mapped) if source else None)
     stages = module.stages(config["algorithm"], chosen)
     asked = _asked(config["seeds"])
     device = usable_device(config["device"], module.FAMILY)
@@ -135,9 +136,11 @@ def _source(config: Plain, tasks: list[Env]) -> Plan | None:
     return found
 
 
-def _past(source: Plan) -> Past:
+def _past(source: Plan, mapped: bool) -> Past:
     """What a run that starts from another needs to know of it."""
-    return Past(source.stages[-1].number, source.length, source.all_tasks)
+    last = source.stages[-1]
+    learner = None if mapped else last.learner
+    return Past(last.number, source.length, source.all_tasks, learner)
 
 
 def _asked(section: Plain) -> tuple[int, ...]:

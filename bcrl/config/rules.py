@@ -96,6 +96,12 @@ def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
             _check_dqn(chosen, learner, start)
         elif isinstance(learner, LSPI):
             _check_slot(chosen, learner, slot, start)
+    if chosen.past and start.initial is not ZERO:
+        given = chosen.past.learner
+        if isinstance(learners[0], DQN) and not isinstance(given, DQN):
+            why = "leaves no network to train further: boosting=on or a transfer needed"
+            raise ConfigError("start.from", getattr(given, "name", given), why)
+        learners = [given, *learners] if given else learners
     for one, other in pairwise(learners):
         for name in PASSED_ON.get(type(other), ()) if start.initial is not ZERO else ():
             here, there = getattr(one, name, None), getattr(other, name)

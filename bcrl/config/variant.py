@@ -26,6 +26,7 @@ class Past:
     stages: int
     count: int  # iterations or environment steps
     tasks: tuple[Env, ...]
+    learner: Any = None  # of the last stage; None if its approximator isn't passed on
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ def start(plan: Plan, batch: SeedBatch) -> StageResult | None:
             raise BcrlError(f"start.from: {folder} {why}")
         parts.append(read_agent(folder, seed, document, source, batch).result)
     whole: StageResult = joined(parts)
-    if (name := plan.config["start"]["observation"]) is None:
+    if (name := plan.config["start"].get("observation")) is None:
         return whole
     return StageResult(Mapped(whole.q, name), Mapped(whole.residual, name))
 
@@ -69,8 +69,6 @@ def read_agent(
     if (needed := _PER_BYTE * size * trees) > (there := available()):
         what = f"{path} needs up to {needed / 2**30:.0f} GiB of memory for its trees"
         raise BcrlError(f"{what}, but there are {there / 2**30:.0f}")
-    if made.family == "DQN":  # FQI does without torch, which is slow to import
-        from bcrl.q.networks import mlp  # noqa: F401 (a file holds its classes)
     own = serialization.read_content(path, given(made.all_stages, batch))
     if not isinstance(own, Learned) or about.get("seed") != seed:
         raise BcrlError(f"{path} holds no agent of seed {seed}; remove it")

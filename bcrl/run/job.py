@@ -87,8 +87,6 @@ class _Training:
         self.job, self.held, self.log = job, held, log
         self.plan, self.seeds = plan, seeds = job.plan, job.seeds
         dqn, common = plan.family == "DQN", (seeds, plan.tasks)
-        if dqn:  # FQI does without torch, which is slow to import
-            from bcrl.learning import dqn_trainer  # noqa: F401 (a checkpoint holds it)
         self.probe: Probe | StepProbe
         self.probe = StepProbe(*common) if dqn else Probe(*common, plan.metrics)
         batch = SeedBatch(seeds, self.probe.states, job.threads, plan.device)

@@ -82,6 +82,17 @@ def test_a_moved_folder_is_the_same_run(tmp_path):
     assert compared(second, again) is None
 
 
+def test_observations_are_mapped_for_the_earlier_agents(tmp_path):
+    first = run(tmp_path / "first", *hill(0.8))
+    words = (*hill(1.2), "variant=BC", f"start.from={first.directory}")
+    plain = run(tmp_path / "plain", *words)
+    mapped = run(tmp_path / "mapped", *words, "start.observation=tests.toys.same")
+    assert rows(mapped, 1) == rows(plain, 1)
+    x = np.random.default_rng(0).uniform([-1, -3], [1, 3], (500, 2))
+    agent = bcrl.load(mapped.directory, 1, trust="tests")
+    assert (agent.q(x) == bcrl.load(plain.directory, 1).q(x)).all()
+
+
 def test_what_a_run_cant_start_from_is_refused(tmp_path):
     first = run(tmp_path / "a", *hill(0.8))
     kept = f"start.from={first.directory}"
