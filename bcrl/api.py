@@ -26,6 +26,7 @@ from bcrl.errors import BcrlError, ConfigError
 from bcrl.evaluation import metrics as fqi_metrics
 from bcrl.evaluation.step_metrics import StepProbe
 from bcrl.learning.dqn import DQN
+from bcrl.learning.export import export
 from bcrl.learning.fqi import FQI
 from bcrl.learning.lspi import LSPI
 from bcrl.learning.stage import Learner, SeedBatch, Stage, Transfer, learn
@@ -34,10 +35,11 @@ from bcrl.q.regressors.ours import ForestRegressor as Forest
 from bcrl.q.regressors.ours import Tabular
 from bcrl.q.regressors.scikit import Sklearn
 from bcrl.results.tables import read_folder as read
+from bcrl.run.agents import load
 from bcrl.run.workers import cores
 
 __all__ = ["CarOnHill", "Gymnasium", "LinearSystem", "Maze", "compiled_step"]
-__all__ += ["read", "run", "stages"]
+__all__ += ["export", "load", "read", "run", "stages"]
 __all__ += ["DQN", "FQI", "LSPI", "Forest", "Sklearn", "Tabular"]
 __all__ += ["Boost", "PolicyReuse", "ResidualPolicy", "Shape", "warm_start"]
 

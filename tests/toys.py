@@ -124,3 +124,8 @@ class SimulatedLanes:
 
     def close(self):
         pass
+
+
+def same(observation: np.ndarray) -> np.ndarray:
+    """An observation as it is, for `start.observation`."""
+    return observation

@@ -40,9 +40,14 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> Path:
     return path
 
 
+def write_bytes(path: Path, data: bytes) -> Path:
+    """Write a file, atomically."""
+    return write_atomically(path, lambda handle: handle.write(data))
+
+
 def write_text(path: Path, text: str) -> Path:
     """Write UTF-8 text with Unix line ends, atomically."""
-    return write_atomically(path, lambda handle: handle.write(text.encode()))
+    return write_bytes(path, text.encode())
 
 
 def user_folder(variable: str, usual: str) -> Path | None:

@@ -7,14 +7,16 @@ Plain = dict[str, Any]  # a resolved config: dicts, lists and scalars
 
 #: Top-level keys that change no number, but for another device's rounding.
 OUTPUT_KEYS = ("seeds", "workers", "threads", "device", "runs_dir", "tag", "progress")
-OUTPUT_KEYS += ("strict", "checkpoint_every", "logger")
+OUTPUT_KEYS += ("strict", "checkpoint_every", "logger", "keep", "extend")
 
 
 def identity(config: Plain) -> Plain:
     """The part of a config that decides numbers."""
     kept = {k: v for k, v in config.items() if k not in OUTPUT_KEYS}
     env = {k: v for k, v in kept["env"].items() if k != "paper_seeds"}
-    return kept | {"env": env}
+    # A run decides what starts from it by its config, wherever its folder is.
+    start = {k: v for k, v in kept.pop("start", {}).items() if v and k != "from"}
+    return kept | {"env": env} | ({"start": start} if start else {})
 
 
 def differences(config: Plain, other: Plain) -> dict[str, tuple[Any, Any]]:

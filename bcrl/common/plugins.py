@@ -22,7 +22,7 @@ VARIABLE = "BCRL_TRUST"  # of this process and the workers that it starts
 NAMING = ("env.name", "env.id", "env.observation", "env.tasks.observation")
 NAMING += ("env.wrappers", "env.tasks.wrappers", "algorithm.name")
 NAMING += ("algorithm.regressor.name", "curriculum.name", "transfer.name")
-NAMING += ("logger.name",)
+NAMING += ("logger.name", "start.observation")
 
 
 def named_code(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

@@ -5,10 +5,14 @@ these come back: reading a file runs none of its content.
 """
 
 import dataclasses
+import importlib
+import io
 import json
 import math
+import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -20,6 +24,7 @@ from bcrl.errors import BcrlError
 #: Metadata of a dataclass's field that isn't stored: it follows from the others.
 DERIVED = {"derived": True}
 _STORABLE: dict[str, type] = {}
+_OURS = ("bcrl.envs.", "bcrl.learning.", "bcrl.q.")  # where storable classes are
 _PLAIN = (type(None), bool, int, float, str)
 
 
@@ -29,15 +34,31 @@ def storable(cls: type) -> type:
     return cls
 
 
+def is_storable(cls: type) -> bool:
+    """Whether instances of a class are stored field by field."""
+    return _STORABLE.get(_name(cls)) is cls
+
+
+def is_derived(field: dataclasses.Field) -> bool:
+    """Whether a dataclass's field isn't stored."""
+    return bool(field.metadata.get("derived"))
+
+
 def _name(cls: type) -> str:
     """A class's name in a file, with its module: a user's `Sum` is not ours."""
     return f"{cls.__module__}.{cls.__qualname__}"
 
 
+def _class(name: str) -> type:
+    """The storable class of a name; of our classes, the module is imported."""
+    if name not in _STORABLE and name.startswith(_OURS):  # networks import torch
+        importlib.import_module(name.rpartition(".")[0])
+    return _STORABLE[name]
+
+
 def _fields(cls: type) -> list[str]:
     """The names of a dataclass's fields that are stored."""
-    fields = dataclasses.fields(cls)
-    return [f.name for f in fields if not f.metadata.get("derived")]
+    return [f.name for f in dataclasses.fields(cls) if not is_derived(f)]
 
 
 def write(file: BinaryIO, about: dict, content: Any, given: Sequence[Any]) -> None:
@@ -55,28 +76,56 @@ def write(file: BinaryIO, about: dict, content: Any, given: Sequence[Any]) -> No
     np.savez(file, **texts, data=data)
 
 
+def written(about: dict, content: Any, given: Sequence[Any]) -> bytes:
+    """What `write` writes."""
+    write(file := io.BytesIO(), about, content, given)
+    return file.getvalue()
+
+
+def relabelled(path: Path, about: dict) -> bytes:
+    """A stored file with another document about its content."""
+    with _opened(path) as stored:
+        parts = {name: stored(name) for name in ("structure", "data")}
+    np.savez(file := io.BytesIO(), about=json.dumps(about).encode(), **parts)
+    return file.getvalue()
+
+
 def read_about(path: Path) -> dict:
     """The document about an NPZ's content; BcrlError if the file can't be read."""
     with _opened(path) as stored:
-        return dict(json.loads(stored["about"].tobytes()))
+        return dict(json.loads(stored("about").tobytes()))
 
 
 def read_content(path: Path, given: Sequence[Any], device: str = "cpu") -> Any:
     """The content that `write` stored, tensors on `device`; BcrlError if damaged."""
     with _opened(path) as stored:
-        structure = json.loads(stored["structure"].tobytes())
-        return _Unpacker(stored["data"], given, device).unpack(structure)
+        structure = json.loads(stored("structure").tobytes())
+        return _Unpacker(stored("data"), given, device).unpack(structure)
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     """An open NPZ; all that may be wrong with it becomes a BcrlError."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            yield stored
+        with zipfile.ZipFile(path) as stored:
+            yield partial(_bytes, stored)
     except Exception as error:
         why = f"can't be read ({error}); remove it, then its seeds start anew"
         raise BcrlError(f"{path} {why}") from error
+
+
+def _bytes(stored: zipfile.ZipFile, name: str) -> NDArray[np.uint8]:
+    """The bytes of an array or text; they take no more memory than the file."""
+    info = stored.getinfo(f"{name}.npy")
+    if info.compress_type != zipfile.ZIP_STORED:
+        raise ValueError(f"{name} is compressed")
+    with stored.open(info) as member:
+        np.lib.format.read_magic(member)
+        shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+        data = np.frombuffer(member.read(), np.uint8)
+    if math.prod(shape) * dtype.itemsize != data.size:
+        raise ValueError(f"{name} is cut")
+    return data
 
 
 class _Packer:
@@ -101,7 +150,7 @@ class _Packer:
             parts = [self.pack(part) for part in thing]
         elif kind is dict:
             parts = [[self.pack(k), self.pack(v)] for k, v in thing.items()]
-        elif _STORABLE.get(_name(kind)) is kind:
+        elif is_storable(kind):
             fields = {key: self.pack(getattr(thing, key)) for key in _fields(kind)}
             name, parts = "object", [_name(kind), fields]
         else:
@@ -141,9 +190,9 @@ class _Unpacker:
             whole = whole if kind == "list" else tuple(whole)
         elif kind == "dict":
             whole = {self.unpack(k): self.unpack(v) for k, v in parts}
-        elif kind == "object" and parts[1].keys() == set(_fields(_STORABLE[parts[0]])):
+        elif kind == "object" and parts[1].keys() == set(_fields(_class(parts[0]))):
             fields = {key: self.unpack(value) for key, value in parts[1].items()}
-            whole = _STORABLE[parts[0]](**fields)
+            whole = _class(parts[0])(**fields)
         else:
             raise ValueError(f"this version knows no such {kind}")
         self.made.append(whole)

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from bcrl.common import plugins
 from bcrl.common.files import sha256
-from bcrl.common.identity import OUTPUT_KEYS, Plain, differences, flat
+from bcrl.common.identity import OUTPUT_KEYS, Plain, differences, flat, identity
 from bcrl.config import hydra_compose, safety, schema
 from bcrl.config import plan as planning
 from bcrl.config.hints import Hints
@@ -21,6 +21,8 @@ from bcrl.config.overrides import canonical, parse, product
 from bcrl.config.plan import Plan
 from bcrl.config.schema import VARIANT_GROUPS
 from bcrl.errors import BcrlError, ConfigError, closest
+from bcrl.results.layout import recorded_seeds
+from bcrl.results.read import read_document
 
 #: The options that follow the authors' code, all of them with the tag `released`.
 RELEASED = {"boosting=on": "released", "transfer=shaping": "shaping_released"}
@@ -205,7 +207,20 @@ def _plain(job: DictConfig) -> Plain:
         if not isinstance(config[key], dict):  # a file's `boosting: 'on'`
             why = f"is a section; an option stands in defaults: [override /{key}: …]"
             raise ConfigError(key, config[key], why)
+    if (folder := config["start"].get("from")) is not None:
+        config["start"]["run"] = _recorded(folder)
     for key, value in flat(config).items():  # tag=${env.gamma}
         if key in schema.TEXTS and not isinstance(value, str | None):
             raise ConfigError(key, value, "must be text: add some to the ${…}")
     return config
+
+
+def _recorded(folder: object) -> Plain:
+    """What the run in a folder says about itself; ConfigError if there is none."""
+    place = Path(str(folder)).absolute()
+    if not (seeds := recorded_seeds(place, "json")):
+        why = "holds no run; name one such as runs/quick/maze/BC-FQI"
+        raise ConfigError("start.from", folder, why)
+    document = read_document(place, seeds[0])
+    named = {"env": document["env"], "tag": document["tag"]}
+    return named | {"config": identity(document["config"])}

@@ -7,11 +7,11 @@ from typing import Any
 
 from bcrl.common import plugins
 from bcrl.common.checks import construct, one_of
-from bcrl.common.identity import Plain
+from bcrl.common.identity import OUTPUT_KEYS, Plain
 from bcrl.config.algorithms import algorithm
 from bcrl.config.rules import check_numbers
-from bcrl.config.schema import Choice, Config, check_name, check_path
-from bcrl.config.variant import Composition, composition
+from bcrl.config.schema import Choice, Config, Start, check_name, check_path
+from bcrl.config.variant import Composition, Past, composition
 from bcrl.envs import Env, check_tasks, tasks_of
 from bcrl.errors import ConfigError, did_you_mean
 from bcrl.evaluation.metrics import check_metrics
@@ -19,6 +19,7 @@ from bcrl.learning.stage import Stage
 from bcrl.learning.transfer import PolicyReuse, ResidualPolicy, Shape
 from bcrl.results.loggers import logger
 
+KEEP = ("none", "final", "stages", "state")  # of what a complete seed has learned
 LOCKSTEP_ON_GPU = 500  # seeds: a step takes little longer than that of 100
 
 
@@ -41,6 +42,7 @@ class Plan:
     sources: str = ""  # a digest of the user's code that it runs
     command: str = ""  # what runs this plan alone, a line each if there are several
     launcher: Plain | None = None  # of Slurm's parameters, if its jobs run this
+    source: "Plan | None" = None  # the run whose agents the first stage starts from
 
     @property
     def target(self) -> Env:
@@ -64,8 +66,19 @@ class Plan:
 
     @property
     def length(self) -> int:
-        """Iterations or environment steps of all stages."""
-        return sum(stage.learner.length for stage in self.stages)
+        """Iterations or environment steps of all stages, those of sources included."""
+        return self.stages[-1].before + self.stages[-1].learner.length
+
+    @property
+    def all_stages(self) -> tuple[Stage, ...]:
+        """The stages of the run, and those of the runs that it starts from."""
+        return (*self.stages, *(self.source.all_stages if self.source else ()))
+
+    @property
+    def all_tasks(self) -> tuple[Env, ...]:
+        """The different tasks of all stages, earlier ones first."""
+        earlier = self.source.all_tasks if self.source else ()
+        return (*earlier, *(task for task in self.tasks if task not in earlier))
 
 
 def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
@@ -74,7 +87,9 @@ def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
     check_name("env", env)
     tasks, metrics = _tasks(config["env"])
     module = algorithm(str(config["algorithm"].get("name")))
-    chosen = composition(config, tasks)
+    source = _source(config, tasks)
+    mapped = bool(config["start"].get("observation"))
+    chosen = composition(config, tasks, _past(source, mapped) if source else None)
     stages = module.stages(config["algorithm"], chosen)
     asked = _asked(config["seeds"])
     device = usable_device(config["device"], module.FAMILY)
@@ -93,8 +108,39 @@ def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
         device=device,
         config=config,
         sources=plugins.fingerprint(config),
+        source=source,
         **more,
     )
+
+
+def _source(config: Plain, tasks: list[Env]) -> Plan | None:
+    """The plan of the run that `start` names; ConfigError if its agents don't fit."""
+    section = {k: v for k, v in config["start"].items() if k != "from"}
+    given: Start = construct("start", Start, section)
+    if given.run is None:
+        if given.observation is not None:
+            why = "maps observations for another run's agents; name it: start.from="
+            raise ConfigError("start.observation", given.observation, why)
+        return None
+    output = {key: config[key] for key in OUTPUT_KEYS}
+    start = {"start": {"from": None, "observation": None}}
+    whole = start | output | given.run["config"]
+    found = plan(whole, given.run["env"], given.run["tag"])
+    for name in ("n_actions", "state_dim"):
+        new, old = (getattr(task, name) for task in (tasks[-1], found.target))
+        if new != old and (name == "n_actions" or given.observation is None):
+            why = f"its agents' {name} is {old}, but this run's is {new}"
+            if name == "state_dim":
+                why += "; start.observation=module.function can map observations"
+            raise ConfigError("start.from", config["start"].get("from"), why)
+    return found
+
+
+def _past(source: Plan, mapped: bool) -> Past:
+    """What a run that starts from another needs to know of it."""
+    last = source.stages[-1]
+    learner = None if mapped else last.learner
+    return Past(last.number, source.length, source.all_tasks, learner)
 
 
 def _asked(section: Plain) -> tuple[int, ...]:
@@ -124,7 +170,7 @@ def _variant(algorithm_name: str, chosen: Composition) -> str:
     """`SBC-DQN` and the like; policy reuse and residual policy by their own names."""
     transfer = chosen.transfer
     prefix = "S" * isinstance(transfer, Shape) + "B" * (chosen.boost is not None)
-    prefix += "C" * (not chosen.target_only)
+    prefix += "C" * (not chosen.target_only or chosen.past is not None)
     whole = f"{prefix}-{algorithm_name.rpartition('.')[2].upper()}".lstrip("-")
     if isinstance(transfer, ResidualPolicy):
         return "RPL"
@@ -159,6 +205,7 @@ def _check_outputs(config: Plain, tag: str | None) -> None:
         check_numbers(section, {k: v for k, v in values.items() if v is not None})
     logger(config["logger"])
     one_of("progress", config["progress"], ["auto", "bar", "lines", "none"])
+    one_of("keep", config["keep"], KEEP)
     check_path("runs_dir", config["runs_dir"])
     check_name("scale.name", config["scale"]["name"])
     if tag is not None:

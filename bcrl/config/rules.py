@@ -9,7 +9,7 @@ from typing import Any, cast
 
 from bcrl.common.checks import one_of
 from bcrl.common.identity import Plain
-from bcrl.config.variant import Composition
+from bcrl.config.variant import Composition, Past
 from bcrl.envs import Env, is_finite
 from bcrl.errors import ConfigError
 from bcrl.learning.dqn import DQN
@@ -54,15 +54,18 @@ def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...
     start, made = chosen.start, list[Stage]()
     known = (start.base, start.initial, start.prior) if start else ()
     has_policy = start is None or any(q is not ZERO for q in known)
-    for number, (task, learner) in enumerate(slots, start=1):
+    past = chosen.past or Past(0, 0, ())
+    known_tasks = [*past.tasks, *(t for t in chosen.tasks if t not in past.tasks)]
+    for number, (task, learner) in enumerate(slots, start=past.stages + 1):
         env = chosen.tasks[task]
         if isinstance(learner, FQI) and not learner.new_data:
             learner = _with_data(learner, env, made)
-        if isinstance(learner, DQN) and made and has_policy:
+        if isinstance(learner, DQN) and number > 1 and has_policy:
             learner = replace(learner, random_steps=0)
-        made.append(Stage(number, task + 1, env, learner, chosen.transfers, 0))
+        place = known_tasks.index(env) + 1 if past.tasks else task + 1
+        made.append(Stage(number, place, env, learner, chosen.transfers, 0))
     ready = [_capped(stage.learner, chosen.scale) for stage in made]
-    before = accumulate((learner.length for learner in ready), initial=0)
+    before = accumulate((learner.length for learner in ready), initial=past.count)
     each = zip(made, ready, before, strict=False)
     return tuple(replace(stage, learner=x, before=n) for stage, x, n in each)
 
@@ -93,6 +96,12 @@ def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
             _check_dqn(chosen, learner, start)
         elif isinstance(learner, LSPI):
             _check_slot(chosen, learner, slot, start)
+    if chosen.past and start.initial is not ZERO:
+        given = chosen.past.learner
+        if isinstance(learners[0], DQN) and not isinstance(given, DQN):
+            why = "leaves no network to train further: boosting=on or a transfer needed"
+            raise ConfigError("start.from", getattr(given, "name", given), why)
+        learners = [given, *learners] if given else learners
     for one, other in pairwise(learners):
         for name in PASSED_ON.get(type(other), ()) if start.initial is not ZERO else ():
             here, there = getattr(one, name, None), getattr(other, name)
@@ -143,9 +152,9 @@ def _check_slot(chosen: Composition, lspi: LSPI, slot: int, start: StageInit) ->
     env, why = chosen.slots[slot], ""
     if getattr(env, "linear_quadratic", None) is None or not hasattr(env, "push"):
         why = f"learns quadratic Q-functions, but {env} is no linear-quadratic task"
-    elif start.initial is not ZERO:
+    elif start.initial is not ZERO and len(chosen.order) > 1:
         why = "leaves no network to start DQN's from: boosting=on or a transfer needed"
-    elif slot:
+    elif slot or chosen.past:
         why = "starts from nothing: LSPI in the first slot only, DQN in the others"
     if why:
         raise ConfigError("algorithm.learners", lspi.name, why)

@@ -19,7 +19,15 @@ VARIANT_GROUPS = ("env", "algorithm", "curriculum", "boosting", "transfer", "sca
 _OF_SLURM = get_type_hints(SlurmQueueConf).items()
 #: The keys whose values are text, those of Slurm's launcher among them.
 TEXTS = {f"hydra.launcher.{k}" for k, hint in _OF_SLURM if hint in (str, str | None)}
-TEXTS |= {"curriculum.name", "device", "progress", "runs_dir", "scale.name"}
+TEXTS |= {
+    "curriculum.name",
+    "device",
+    "extend",
+    "keep",
+    "progress",
+    "runs_dir",
+    "scale.name",
+}
 TEXTS |= {"seeds.part", "tag"}
 
 
@@ -52,6 +60,14 @@ class Choice:
 
 
 @dataclass
+class Start:
+    """The run whose agents the first stage starts from."""
+
+    observation: str | None = None
+    run: Any = None  # its environment's name, tag and config, read from its folder
+
+
+@dataclass
 class Config:
     """What `conf/` composes; sections of type Any are checked by their own classes."""
 
@@ -71,6 +87,9 @@ class Config:
     strict: bool = False
     logger: Any = field(default_factory=lambda: {"name": "none"})
     checkpoint_every: float = 60.0
+    start: Any = field(default_factory=lambda: {"from": None, "observation": None})
+    keep: str = "final"
+    extend: str | None = None
 
 
 def section_of_seeds(key: str, value: object) -> dict[str, Any]:

@@ -20,6 +20,16 @@ ONE_TASK = "there is one task; env.tasks needs at least two values"
 
 
 @dataclass(frozen=True)
+class Past:
+    """What was learned before the first stage, by the run that it starts from."""
+
+    stages: int
+    count: int  # iterations or environment steps
+    tasks: tuple[Env, ...]
+    learner: Any = None  # of the last stage; None if its approximator isn't passed on
+
+
+@dataclass(frozen=True)
 class Composition:
     """What the groups besides `algorithm` choose, as an algorithm sees it."""
 
@@ -28,6 +38,7 @@ class Composition:
     boost: handed.Boost | None = None
     transfer: handed.Transfer | None = None
     scale: Plain = field(default_factory=dict)
+    past: Past | None = None  # None: the first stage starts from nothing
 
     @property
     def transfers(self) -> tuple[handed.Transfer, ...]:
@@ -56,13 +67,13 @@ class Composition:
     def __post_init__(self) -> None:
         """Raise ConfigError for choices that make no sense together."""
         boost, transfer, start = self.boost, self.transfer, self.start
-        if len(self.order) == 1 and self._chosen:
+        if len(self.order) == 1 and self._chosen and self.past is None:
             key = "boosting" if boost else "transfer"
             raise ConfigError(key, boost or transfer, ONE_TASK)
         if start is None:
             return
         why, residual = "", isinstance(start.behavior, handed.ResidualPolicy)
-        if start.behavior and self.target_only:
+        if start.behavior and self.target_only and self.past is None:
             why = "needs an earlier task whose policy helps: curriculum=on"
         elif residual and getattr(self.tasks[-1], "actions", None) is None:
             why = "combines actions as vectors, which env.action_vectors has to name"
@@ -76,21 +87,23 @@ class Composition:
                 raise ConfigError(key, one, "has no effect: stages start as without it")
 
 
-def composition(config: Plain, tasks: list[Env]) -> Composition:
+def composition(config: Plain, tasks: list[Env], past: Past | None) -> Composition:
     """The groups' choices; ConfigError if they make no sense together."""
     boost = _component("boosting", config["boosting"], {"on": handed.Boost})
     transfer = _component("transfer", config["transfer"], handed.TRANSFERS)
-    order = order_of(config["curriculum"]["name"], tasks)
-    return Composition(tuple(tasks), order, boost, transfer, config["scale"])
+    order = order_of(config["curriculum"]["name"], tasks, past)
+    return Composition(tuple(tasks), order, boost, transfer, config["scale"], past)
 
 
-def order_of(curriculum: object, tasks: Sequence[Env]) -> tuple[int, ...]:
+def order_of(
+    curriculum: object, tasks: Sequence[Env], past: Past | None = None
+) -> tuple[int, ...]:
     """The task of each of n slots; ConfigError for an order without the target.
 
     `curriculum` is one of CURRICULA, a trusted `module.function` or a function of n.
     """
     n = len(tasks)
-    if n == 1 and curriculum != "off":
+    if n == 1 and curriculum != "off" and past is None:
         raise ConfigError("curriculum", curriculum, ONE_TASK)
     ordered: Any = curriculum
     if isinstance(curriculum, str) and "." in curriculum:

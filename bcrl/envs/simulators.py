@@ -77,7 +77,7 @@ class Simulator:
         answer = self._call("reset", self.env.reset, seed=int(self.number * SEEDS))
         seen, info = self._values("reset", answer, "observation, info")
         self.succeeded = self._success("reset", info)
-        self.seen = self._vector("reset", seen)
+        self.seen = self.vector("reset", seen)
         return self.seen
 
     def step(self, action: int) -> tuple[Floats, float, bool, bool]:
@@ -94,7 +94,7 @@ class Simulator:
         answer = self._call("step", self.env.step, self.actions.start + action)
         names = "observation, reward, terminated, truncated, info"
         seen, reward, ended, cut, info = self._values("step", answer, names)
-        self.seen = self._vector("step", seen)
+        self.seen = self.vector("step", seen)
         reward = self._plain("reward", reward, float)
         ended = self._plain("terminated", ended, bool)
         cut = self._plain("truncated", cut, bool)
@@ -123,8 +123,8 @@ class Simulator:
         expected = f"{count} values: {names}, as in Gymnasium 0.26 and later"
         raise self._wrong(method, f"gave {found}", expected)
 
-    def _vector(self, method: str, seen: Any) -> Floats:
-        """An observation as a new vector (d,) of finite numbers."""
+    def vector(self, method: str, seen: Any) -> Floats:
+        """An observation as a new vector (d,); BrokenSimulator if it is none."""
         if self._map is not None:
             method = f"env.observation={self.recipe.observation}"
             seen = self._call(method, self._map, seen)

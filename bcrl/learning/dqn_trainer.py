@@ -17,7 +17,14 @@ from bcrl.learning.policies import combined_actions, epsilon_greedy, greedy
 from bcrl.learning.replay import Replay, batched, one_by_one
 from bcrl.learning.rollout import CHOICES
 from bcrl.learning.stage import Pause, SeedBatch, Stage, StepSnapshot
-from bcrl.learning.transfer import PolicyReuse, ResidualPolicy, StageInit, StageResult
+from bcrl.learning.transfer import (
+    Acting,
+    PolicyReuse,
+    ResidualPolicy,
+    StageInit,
+    StageResult,
+)
+from bcrl.q.functions import Q, add
 from bcrl.q.networks.mlp import Adam, DeepQ, Networks, xavier
 
 DRAW_BLOCK = 500  # steps per block; each block has its own random stream
@@ -190,11 +197,11 @@ class DQNTrainer:
         now, trained = self.state, self.state.step - self.settings.random_steps
         due = trained >= 0 and trained % self.settings.evaluate_every == 0
         if due or now.step == self.settings.length:
-            return self.snapshot()
+            return self.snapshot(due)
         return Pause(self.stage, self.stage.before + now.step, now)
 
-    def snapshot(self) -> StepSnapshot:
-        """The present snapshot; starts a new mean of the loss."""
+    def snapshot(self, due: bool = True) -> StepSnapshot:
+        """The present snapshot; one that is `due` starts a new mean of the loss."""
         now, count = self.state, self.stage.before + self.state.step
         weights = torch.isfinite(now.deep.online.flat).all(1).cpu().numpy()
         failed: dict[int, str] = {}
@@ -202,11 +209,24 @@ class DQNTrainer:
             lost = np.flatnonzero(~finite).tolist()
             failed |= dict.fromkeys(lost, f"non-finite {part}")
         loss = now.loss / now.updates if now.updates else now.loss + np.nan
-        now.loss, now.updates = np.zeros_like(loss), 0
-        result = StageResult(self.start.total(now.deep), now.deep)
+        if due:  # a longer run continues from the state at the end
+            now.loss, now.updates = np.zeros_like(loss), 0
+        q = self.start.total(now.deep)
+        result = StageResult(q, now.deep, acting=self._acting())
         measured = (self._evaluated_policy, self.settings.evaluation_episodes, loss)
         failed |= now.lanes.failures  # each seed has one lane
         return StepSnapshot(self.stage, count, now, result, *measured, failed=failed)
+
+    def _acting(self) -> Acting:
+        """What the greedy policy reads at present."""
+        start, now = self.start, self.state
+        own: Q = now.deep
+        if start.boost.greedy_on == "sum":
+            own = add(start.base, own)
+        if not isinstance(start.behavior, ResidualPolicy):
+            return Acting(own, np.zeros(len(now.loss), bool))
+        copying = now.n_greedy_decisions < start.behavior.offset
+        return Acting(own, copying, start.prior)
 
     def _evaluated_policy(self, states: Any, u: Floats, alive: Any) -> Integers:
         """A `Policy`: half of the lanes explore, the rest is greedy and without PPR."""

@@ -99,14 +99,18 @@ class CurriculumRun:
     stages: Sequence[Stage]
     batch: SeedBatch
     state: RunState = RunState(0, None)  # with the latest pause's a new run resumes
+    ending: RunState | None = None  # from it, a run whose last stage is longer resumes
+    earlier: Sequence[Stage] = ()  # of the run whose result the first stage starts from
 
     def __iter__(self) -> Iterator[Pause]:
-        for stage in self.stages[self.state.stages :]:
+        for stage in (s for s in self.stages if s.number > self.state.stages):
             now, learner = self.state, stage.learner
             start = begin(stage.transfers, now.result)
             for pause in learner.learn(stage, start, self.batch, now.state):
                 if isinstance(pause, Snapshot) and pause.last_of_stage:
                     self.state = RunState(stage.number, pause.result)
+                    if stage is self.stages[-1]:
+                        self.ending = RunState(now.stages, now.result, pause.state)
                 else:
                     self.state = RunState(now.stages, now.result, pause.state)
                 yield pause
@@ -119,7 +123,7 @@ class CurriculumRun:
     def given(self) -> list[Any]:
         """What a stored `state` refers to and does not contain: settings, tasks."""
         found = [ZERO, self.batch]
-        for stage in self.stages:
+        for stage in (*self.stages, *self.earlier):
             found += stage.env, *vars(stage.learner).values()
         return found
 

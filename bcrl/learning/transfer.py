@@ -5,12 +5,27 @@ can be combined: `Boost` and `Shape` make SBC-DQN.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
+from bcrl.common.seed_axis import seeds_on
 from bcrl.common.serialization import storable
 from bcrl.errors import ConfigError, at_least
 from bcrl.q.functions import ZERO, Q, Shaped, Sum, add, memoized
+
+
+@storable
+@dataclass(frozen=True)
+class Acting:
+    """What the greedy policy of a stage reads instead of its Q (DQN)."""
+
+    own: Q  # the own action is greedy on it: base + ϱ, or ϱ alone
+    #: (S,) RPL: whether the own action still copies the prior's.
+    copying: NDArray[np.bool_] = field(metadata=seeds_on(0))
+    prior: Q = ZERO  # RPL: the executed action is nearest to the prior's + the own one
 
 
 @storable
@@ -21,6 +36,7 @@ class StageResult:
     q: Q  # of the stage's task: base + ϱ, plus the potential if rewards were shaped
     residual: Q  # ϱ, the approximator; `warm_start` trains it further
     data: Any = None  # transitions that the next stage may learn from again
+    acting: Acting | None = None  # None: the policy is greedy on `q`
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,15 @@
 """Action-value functions of several seeds at once, and sums of them."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import reduce
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.common import plugins
+from bcrl.common.seed_axis import seeds_on
 from bcrl.common.serialization import storable
 from bcrl.envs import FiniteEnv
 from bcrl.errors import BcrlError, LostSeeds
@@ -111,6 +113,22 @@ class Sum:
 
 @storable
 @dataclass(frozen=True)
+class Mapped:
+    """A Q-function of other observations: q(observation(s)), state by state."""
+
+    q: Q
+    observation: str  # the function, module.function
+
+    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        key, name = "start.observation", self.observation
+        of = plugins.attribute(key, name, name)
+        seen = [np.array([of(state) for state in x], np.float64) for x in states]
+        given: Any = np.stack(seen) if isinstance(states, np.ndarray) else seen
+        return self.q(given, n_actions)
+
+
+@storable
+@dataclass(frozen=True)
 class Shaped:
     """base + ϱ + max_a' potential(s, a'), which undoes the shaping of the rewards."""
 
@@ -163,7 +181,7 @@ def memoized(q: Q) -> Q:
 class Table:
     """The Q-table of a finite environment, one array (N, A) per seed."""
 
-    values: Sequence[NDArray[np.float64]]
+    values: Sequence[NDArray[np.float64]] = field(metadata=seeds_on(0))
     env: FiniteEnv
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:

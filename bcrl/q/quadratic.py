@@ -1,7 +1,7 @@
 """Q-functions quadratic in state and action: what LSPI learns in an LQ task."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from bcrl.common.arrays import writable
 from bcrl.common.compiling import kept
+from bcrl.common.seed_axis import seeds_on
 from bcrl.common.serialization import storable
 from bcrl.q.functions import Values, check_states
 
@@ -28,8 +29,9 @@ def features(z: NDArray[np.float64], kind: str) -> NDArray[np.float64]:
 class Quadratic:
     """Q(s, a) = zᵀ M z + lᵀ z with z = (s, a), for S seeds and a table of actions."""
 
-    matrix: NDArray[np.float64]  # (S, m, m), symmetric
-    linear: NDArray[np.float64]  # (S, m)
+    #: (S, m, m), symmetric
+    matrix: NDArray[np.float64] = field(metadata=seeds_on(0))
+    linear: NDArray[np.float64] = field(metadata=seeds_on(0))  # (S, m)
     actions: NDArray[np.float64]  # (A, k)
 
     @classmethod

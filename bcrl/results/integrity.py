@@ -18,7 +18,8 @@ from bcrl.results.read import AGAIN, INCOMPLETE, Document, Finding
 from bcrl.results.tables import parsed
 
 _SHOWN_KEYS = 3  # differing keys of a config that are named
-_NAME = re.compile(rf"{layout.SEED}([0-9]+)\.({'|'.join(layout.SUFFIXES)})")
+_SUFFIXES = "|".join((*layout.SUFFIXES, layout.AGENT))
+_NAME = re.compile(rf"{layout.SEED}([0-9]+)\.({_SUFFIXES})")
 
 
 class Checked(NamedTuple):
@@ -77,6 +78,8 @@ def check_folder(folder: Path) -> Checked:
             complete = (state := state_of(document)) == layout.COMPLETE
             if complete or (state != layout.RUNNING and "sha256" in document):
                 read.read_recorded(npz, document)
+                if (agent := seed_path(folder, seed, layout.AGENT)).exists():
+                    read.read_recorded(agent, document)
                 data = read.read_recorded(csv, document)
                 if complete:
                     tables[seed] = parsed(csv, data, document)

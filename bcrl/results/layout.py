@@ -4,6 +4,7 @@
     config.yaml      the settings that decide numbers, the same for all seeds
     seed_0007.csv    one row per evaluation: INDEX[family], then the metrics
     seed_0007.npz    arrays at the end of training
+    seed_0007.agent  what it learned, to load and act with (keep)
     seed_0007.json   status, config, versions, SHA-256 of the others; written last
 """
 
@@ -14,7 +15,8 @@ from typing import Any
 SCHEMA = 2  # of a seed's files; raised when their meaning changes
 CONFIG = "config.yaml"
 SUFFIXES = ("json", "csv", "npz")
-SEED, CHECKPOINT = "seed_", "checkpoint_"  # what names of files begin with
+AGENT = "agent"  # the suffix of a file that may be removed
+SEED, CHECKPOINT, STATE = "seed_", "checkpoint_", "state_"  # what names begin with
 LOGS = ".tensorboard"  # in runs_dir; hidden, because it holds no results
 
 #: The statuses in a seed's JSON; `failed` is followed by a colon and the reason.

@@ -26,14 +26,14 @@ def save_checkpoint(
     plan: Plan, seeds: Sequence[int], content: Any, given: Sequence[Any]
 ) -> None:
     """Store the batch's `content`, which refers to the objects of `given`."""
-    about, path = _about(plan) | {"seeds": list(seeds)}, checkpoint_path(plan, seeds)
+    about, path = about_of(plan) | {"seeds": list(seeds)}, checkpoint_path(plan, seeds)
     write_atomically(path, lambda to: serialization.write(to, about, content, given))
 
 
-def checkpoint_path(plan: Plan, seeds: Sequence[int]) -> Path:
+def checkpoint_path(plan: Plan, seeds: Sequence[int], kind: str = CHECKPOINT) -> Path:
     """The file of a batch, named by its first seed and a hash of all its seeds."""
     code = sha256(repr(tuple(seeds)).encode())[:8]
-    return plan.directory / f"{CHECKPOINT}{seeds[0]:04d}_{code}.npz"
+    return plan.directory / f"{kind}{seeds[0]:04d}_{code}.npz"
 
 
 def batches(plan: Plan) -> set[tuple[int, ...]]:
@@ -42,8 +42,8 @@ def batches(plan: Plan) -> set[tuple[int, ...]]:
     A checkpoint of other code or another config counts as absent: it can't lead to the
     results of an uninterrupted run. Raises BcrlError for a damaged file.
     """
-    asked, here, found = set(plan.seeds), _about(plan), set()
-    for about in _stored(plan.directory).values():
+    asked, here, found = set(plan.seeds), about_of(plan), set()
+    for about in stored(plan.directory).values():
         if "error" in about:
             raise about["error"]
         seeds = tuple(about.pop("seeds", ()))
@@ -54,16 +54,16 @@ def batches(plan: Plan) -> set[tuple[int, ...]]:
 
 def remove_done(plan: Plan) -> None:
     """Remove the checkpoints whose seeds are all complete."""
-    for path, about in _stored(plan.directory).items():
+    for path, about in stored(plan.directory).items():
         seeds = about.get("seeds", ())
         if seeds and not pending(plan, seeds):
             path.unlink(missing_ok=True)
 
 
-def _stored(directory: Path) -> dict[Path, dict[str, Any]]:
+def stored(directory: Path, kind: str = CHECKPOINT) -> dict[Path, dict[str, Any]]:
     """What each checkpoint says about itself, or the `error` of reading it."""
     found = {}
-    for path in sorted(directory.glob(f"{CHECKPOINT}*.npz")):
+    for path in sorted(directory.glob(f"{kind}*.npz")):
         try:
             found[path] = serialization.read_about(path)
         except BcrlError as error:
@@ -72,7 +72,7 @@ def _stored(directory: Path) -> dict[Path, dict[str, Any]]:
     return found
 
 
-def _about(plan: Plan) -> dict[str, Any]:
+def about_of(plan: Plan) -> dict[str, Any]:
     """The facts that must be equal for a run to resume from a checkpoint."""
     config = sha256(json.dumps(identity(plan.config), sort_keys=True).encode())
     about = {"schema": _SCHEMA, "code": _CODE, "sources": plan.sources}

@@ -19,11 +19,13 @@ from bcrl.common.terminal import say
 from bcrl.errors import BcrlError
 from bcrl.evaluation.metrics import Probe
 from bcrl.evaluation.step_metrics import StepProbe
+from bcrl.learning.learned import packed
 from bcrl.learning.rollout import success_of
-from bcrl.learning.stage import CurriculumRun, SeedBatch, Snapshot
+from bcrl.learning.stage import CurriculumRun, RunState, SeedBatch, Snapshot
+from bcrl.q.functions import Q
 from bcrl.results import loggers
 from bcrl.results.layout import COMPLETE, RUNNING
-from bcrl.run import checkpoints, locks, records
+from bcrl.run import agent_files, checkpoints, extension, locks, records
 from bcrl.run.progress import Tick
 from bcrl.run.schedule import Job
 
@@ -85,21 +87,23 @@ class _Training:
         self.job, self.held, self.log = job, held, log
         self.plan, self.seeds = plan, seeds = job.plan, job.seeds
         dqn, common = plan.family == "DQN", (seeds, plan.tasks)
-        if dqn:  # FQI does without torch, which is slow to import
-            from bcrl.learning import dqn_trainer  # noqa: F401 (a checkpoint holds it)
         self.probe: Probe | StepProbe
         self.probe = StepProbe(*common) if dqn else Probe(*common, plan.metrics)
         batch = SeedBatch(seeds, self.probe.states, job.threads, plan.device)
-        self.run = CurriculumRun(plan.stages, batch)
+        earlier = plan.source.all_stages if plan.source else ()
+        begun = RunState(0, None if job.resumes else agent_files.start(plan, batch))
+        self.run = CurriculumRun(plan.stages, batch, begun, earlier=earlier)
         self.rows: list[list[dict[str, Any]]] = [[] for _ in seeds]  # of the CSVs
+        self.residuals: list[Q] = []  # ϱ of the stages that an agent keeps
         self.failed: dict[int, str] = {}  # by place in the batch
         self.interruptions = 0
         self._began = _clocks()  # minus what was spent before an interruption
         self._path = checkpoints.checkpoint_path(plan, seeds)
         if job.resumes:
             stored = read_content(self._path, self.run.given, plan.device)
-            self.run = CurriculumRun(plan.stages, batch, stored["past"])
+            self.run.state = stored["past"]
             self.probe.kept, self.failed = stored["kept"], stored["failed"]
+            self.residuals = stored["residuals"]
             self.rows, self.interruptions = json.loads(stored["rows"]), stored["stops"]
             self._began -= stored["spent"]
             log(self.probe.index, self.rows)
@@ -127,6 +131,9 @@ class _Training:
                 self._save()
                 saved = time.monotonic()
         failed = self._record(new)
+        if self.plan.config["keep"] == "state" and not failed:
+            self._check_locks()
+            extension.keep(self.plan, self.run, self._content(self.run.ending))
         self._path.unlink(missing_ok=True)
         return failed
 
@@ -141,14 +148,24 @@ class _Training:
             rows += added
         for place, why in self.probe.failed.items():
             self.failed.setdefault(place, f"{why} at {index} {snapshot.count}")
+        if snapshot.last_of_stage:
+            config = self.plan.config
+            boosts = config["boosting"]["name"] != "off"
+            every = boosts or config["keep"] in ("stages", "state")
+            earlier = self.residuals if every else []
+            self.residuals = [*earlier, snapshot.result.residual]
 
     def _save(self) -> None:
-        rows = json.dumps(self.rows)  # faster and smaller as one text
-        content = {"past": self.run.state, "kept": self.probe.kept, "rows": rows}
-        content |= {"failed": self.failed, "stops": self.interruptions}
-        content |= {"spent": _clocks() - self._began}
         self._check_locks()
-        checkpoints.save_checkpoint(self.plan, self.seeds, content, self.run.given)
+        content, given = self._content(self.run.state), self.run.given
+        checkpoints.save_checkpoint(self.plan, self.seeds, content, given)
+
+    def _content(self, past: RunState) -> dict[str, Any]:
+        """All that a run needs to resume at `past`."""
+        rows = json.dumps(self.rows)  # faster and smaller as one text
+        content = {"past": past, "kept": self.probe.kept, "rows": rows}
+        content |= {"residuals": self.residuals, "spent": _clocks() - self._began}
+        return content | {"failed": self.failed, "stops": self.interruptions}
 
     def _check_locks(self) -> None:
         """BcrlError if the folder, and with it the locks, was taken away."""
@@ -172,9 +189,23 @@ class _Training:
             if why := self.failed.get(place) or self.probe.failed.get(place):
                 failed[seed], status = why, f"failed: {why}"
                 say(f"{plan.env} {plan.name}: seed {seed} {status}")
+            agent, own = self._agent(place) if seed not in failed else (None, {})
+            found = self.rows[place], arrays, facts | own, agent
             self._check_locks()
-            records.write_seed(plan, seed, status, self.rows[place], arrays, facts)
+            records.write_seed(plan, seed, status, *found)
         return failed
+
+    def _agent(self, place: int) -> tuple[bytes | None, dict[str, str]]:
+        """The agent's file of the seed at `place`; without one, why there is none."""
+        result = self.run.state.result
+        if self.plan.config["keep"] == "none" or result is None:
+            return None, {"no_agent": "its run had keep=none"}
+        try:
+            stages = self.plan.all_stages
+            own = stages, self.run.batch, result, self.residuals, place
+            return packed(*own), {}
+        except TypeError as error:  # of a user's own class
+            return None, {"no_agent": f"{error}: mark the class @storable"}
 
 
 def _clocks() -> np.ndarray:

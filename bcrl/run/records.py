@@ -108,18 +108,26 @@ def write_status(plan: Plan, seed: int, status: str, facts: Plain) -> None:
 
 
 def write_seed(
-    plan: Plan, seed: int, status: str, rows: list[Plain], arrays: Plain, facts: Plain
+    plan: Plan,
+    seed: int,
+    status: str,
+    rows: list[Plain],
+    arrays: Plain,
+    facts: Plain,
+    agent: bytes | None = None,
 ) -> None:
-    """Write a seed's CSV, NPZ and, last, its JSON with the hashes of both."""
+    """Write a seed's CSV, NPZ, agent if any, and, last, its JSON with their hashes."""
     lines = [",".join(rows[0])]
     # A value that is missing (NaN) is an empty cell, as in the report's tables.
     lines += [",".join(repr(x) if x == x else "" for x in row.values()) for row in rows]
     np.savez(packed := io.BytesIO(), **arrays)
-    data, text = packed.getvalue(), "\n".join([*lines, ""])
-    npz, csv = (seed_path(plan.directory, seed, suffix) for suffix in ("npz", "csv"))
-    files.write_atomically(npz, lambda file: file.write(data))
-    files.write_text(csv, text)
-    hashes = {"npz": files.sha256(data), "csv": files.sha256(text.encode())}
+    contents = {"npz": packed.getvalue(), "csv": "\n".join([*lines, ""]).encode()}
+    seed_path(plan.directory, seed, layout.AGENT).unlink(missing_ok=True)
+    if agent is not None:
+        contents[layout.AGENT] = agent
+    for suffix, data in contents.items():
+        files.write_bytes(seed_path(plan.directory, seed, suffix), data)
+    hashes = {suffix: files.sha256(data) for suffix, data in contents.items()}
     columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     found = {"sha256": hashes, "diverging": diverging(columns)}
     write_status(plan, seed, status, found | facts)

@@ -12,7 +12,16 @@ from bcrl.errors import BcrlError
 from bcrl.evaluation import oracle
 from bcrl.evaluation.metrics import needs_reference
 from bcrl.results.layout import COMPLETE, seed_name
-from bcrl.run import checkpoints, job, locks, memory, records, status
+from bcrl.run import (
+    agent_files,
+    checkpoints,
+    extension,
+    job,
+    locks,
+    memory,
+    records,
+    status,
+)
 from bcrl.run.origin import run_origin
 from bcrl.run.progress import Progress
 from bcrl.run.schedule import Failures, Job, merged, ordered
@@ -38,6 +47,8 @@ def run(*plans: Plan) -> None:
     with stop.on_signals():
         for plan in plans:
             _prepare(plan, quiet)
+            agent_files.check_start(plan, records.pending(plan))
+            extension.adopt(plan)
         while (jobs := ordered(plans, failed)) and not stop.requested:
             if free := [each for each in jobs if _is_free(each)]:
                 _train(free, failed, stop)

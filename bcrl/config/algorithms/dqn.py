@@ -32,7 +32,7 @@ def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
         one_of("algorithm.learners", kind, ("auto", "dqn", "lspi"))
         dqn: DQN = construct("algorithm", DQN, own)
         lq = getattr(chosen.slots[slot], "linear_quadratic", None) is not None
-        first = slot == 0 and chosen.transfers != (warm_start,)
+        first = slot == 0 and not chosen.past and chosen.transfers != (warm_start,)
         if kind == "lspi" or (kind == "auto" and lq and first):
             shared = {k: getattr(dqn, k) for k in ("steps", "evaluation_episodes")}
             learners.append(construct("algorithm.lspi", LSPI, pretraining | shared))

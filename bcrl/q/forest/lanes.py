@@ -55,7 +55,7 @@ def _place(context, b, signature, args):
 
 
 @instructions
-def load(typing, array, i):
+def vector_at(typing, array, i):
     """The vector array[i : i + LANES]."""
 
     def generate(context, b, signature, args):
@@ -128,15 +128,15 @@ def choose_all(
     low, high, cuts, weights, totals = sums
     width, step = U(low.size), U(LANES)
     for g in range(U(0), width, step):
-        row = load(keys, first * width + g)
+        row = vector_at(keys, first * width + g)
         store(low, g, row)
         store(high, g, row)
     for start in range(first, last, CHUNK):
         stop = min(start + CHUNK, last)
         for g in range(U(0), width, step):
-            least, most = load(low, g), load(high, g)
+            least, most = vector_at(low, g), vector_at(high, g)
             for i in range(start, stop):
-                row = load(keys, i * width + g)
+                row = vector_at(keys, i * width + g)
                 least, most = lesser(least, row), greater(most, row)
             store(low, g, least)
             store(high, g, most)
@@ -153,9 +153,9 @@ def choose_all(
     for start in range(first, last, CHUNK):
         stop = min(start + CHUNK, last)
         for g in range(U(0), width, step):
-            cut, w, s = load(cuts, g), load(weights, g), load(totals, g)
+            cut, w, s = vector_at(cuts, g), vector_at(weights, g), vector_at(totals, g)
             for i in range(start, stop):
-                row = load(keys, i * width + g)
+                row = vector_at(keys, i * width + g)
                 count = weight[i] if weight.size > 0 else np.int64(1)
                 w = add_left(w, row, cut, count)
                 s = add_left(s, row, cut, count * target[i])

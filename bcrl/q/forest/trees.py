@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bcrl.common.compiling import compiled, kept
 from bcrl.q.forest.descent import enter, new_descent, planes, sort_node
-from bcrl.q.forest.lanes import LANES, choose_all, load, new_sums, store
+from bcrl.q.forest.lanes import LANES, choose_all, new_sums, store, vector_at
 from bcrl.q.forest.split import (
     NODE,
     U,
@@ -90,9 +90,9 @@ def _move_rows(rows, n, width, depth, start, stop, feature, cut):
             goes_left = U(keys[source + U(feature)] <= cut)
             to = left + ((right - i) & (goes_left - U(1)))  # a choice became a branch
             there, more = (b + to) * width, U(LANES)
-            store(keys, there, load(keys, source))
+            store(keys, there, vector_at(keys, source))
             while more < width:
-                store(keys, there + more, load(keys, source + more))
+                store(keys, there + more, vector_at(keys, source + more))
                 more += U(LANES)
             origin[b + to], target[b + to] = origin[a + i], target[a + i]
             if weight.size > 0:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from bcrl.common.seed_axis import seeds_on
 from bcrl.common.serialization import DERIVED, storable
 from bcrl.q.functions import Values, check_states
 from bcrl.q.networks import cpu
@@ -41,7 +42,7 @@ class Networks:
     """S perceptrons with ReLUs, one per seed; none depends on the others."""
 
     sizes: tuple[int, ...]  # the layers' widths (in, hidden …, out)
-    flat: Tensor  # all parameters, (S, P)
+    flat: Tensor = field(metadata=seeds_on(0))  # all parameters, (S, P)
     _buffers: dict[int, list[Tensor]] = field(
         default_factory=dict, repr=False, metadata=DERIVED
     )
@@ -90,7 +91,7 @@ class Networks:
 class Adam:
     """Adam on parameters (S, P), each seed by itself (Kingma and Ba 2015)."""
 
-    moments: Tensor  # (2, S, P)
+    moments: Tensor = field(metadata=seeds_on(1))  # (2, S, P)
     rate: float
     betas: tuple[float, float] = (0.9, 0.999)
     eps: float = 1e-8

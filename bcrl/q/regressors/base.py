@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bcrl.common.seed_axis import seeds_on
 from bcrl.common.seeding import stream
 from bcrl.common.serialization import DERIVED, storable
 from bcrl.errors import BcrlError, ConfigError, LostSeeds
@@ -141,12 +142,21 @@ FEW = 1000  # states; more take much memory, since each model has its own copy
 class FittedQ:
     """Q as one model per seed and action; an unseen action (None) has the value 0."""
 
-    models: Sequence[Sequence[Fitted | None]]
+    models: Sequence[Sequence[Fitted | None]] = field(metadata=seeds_on(0))
     regressor: Regressor
     team: Any  # its `threads` may be used
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
         return self.together([self], states, n_actions)[0]
+
+    def refit(self) -> None:
+        """Fit again the models that a file has left out."""
+        every = [fitted for row in self.models for fitted in row]
+        lost = [fitted for fitted in every if fitted and fitted.model is None]
+        problems = [deepcopy(fitted.problem) for fitted in lost]
+        fits = self.regressor.fit(problems, True, self.team.threads) if lost else []
+        for fitted, fit in zip(lost, fits, strict=True):
+            fitted.model = fit.model
 
     @staticmethod
     def together(
@@ -160,13 +170,8 @@ class FittedQ:
         mixed = any(term.regressor is not regressor for term in terms)
         if len(terms) > 1 and (mixed or sum(map(len, states)) > FEW):
             return [term(states, n_actions) for term in terms]
-        every = [fitted for term in terms for row in term.models for fitted in row]
-        lost = [fitted for fitted in every if fitted and fitted.model is None]
-        if lost:  # what a checkpoint has left out is fitted again
-            problems = [deepcopy(fitted.problem) for fitted in lost]
-            fits = regressor.fit(problems, True, threads)
-            for fitted, fit in zip(lost, fits, strict=True):
-                fitted.model = fit.model
+        for term in terms:
+            term.refit()
         models: dict[Cell, Any] = {
             (s, a, k): fitted.model
             for k, term in enumerate(terms)

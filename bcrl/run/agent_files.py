@@ -1,0 +1,91 @@
+"""The files of agents: read whole, or joined as what a batch of seeds starts from."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bcrl import __version__
+from bcrl.common import serialization
+from bcrl.common.identity import differences
+from bcrl.common.seed_axis import joined
+from bcrl.config.plan import Plan
+from bcrl.errors import BcrlError, ConfigError
+from bcrl.learning.learned import AGENT_SCHEMA, Learned, given
+from bcrl.learning.stage import SeedBatch
+from bcrl.learning.transfer import StageResult
+from bcrl.q.functions import Mapped
+from bcrl.results.layout import AGENT, COMPLETE, recorded_seeds, seed_path, spelled
+from bcrl.results.read import read_document, read_recorded
+from bcrl.run.memory import available
+
+_PER_BYTE = 2  # bytes of a tree per byte of the rows that it is fitted to again
+
+
+def start(plan: Plan, batch: SeedBatch) -> StageResult | None:
+    """What the first stage starts from: the results of a source's agents, joined."""
+    if (source := plan.source) is None:
+        return None
+    folder = Path(plan.config["start"]["from"]).absolute()
+    parts = []
+    for seed in batch.seeds:
+        document = document_of(folder, seed)
+        if changed := differences(document["config"], source.config):
+            key, (there, here) = next(iter(changed.items()))
+            why = f"has other settings now ({key}: {there!r}, not {here!r})"
+            raise BcrlError(f"start.from: {folder} {why}")
+        parts.append(read_agent(folder, seed, document, source, batch).result)
+    whole: StageResult = joined(parts)
+    if (name := plan.config["start"].get("observation")) is None:
+        return whole
+    return StageResult(Mapped(whole.q, name), Mapped(whole.residual, name))
+
+
+def check_start(plan: Plan, seeds: Sequence[int]) -> None:
+    """Raise ConfigError if the run to start from has no agents of some seeds."""
+    if plan.source is None:
+        return
+    named = plan.config["start"]["from"]
+    there = recorded_seeds(Path(named), AGENT)
+    if lost := sorted(set(seeds) - set(there)):
+        why = f"has no agents of seeds {spelled(lost)}; run them there first"
+        raise ConfigError("start.from", named, why)
+
+
+def read_agent(
+    folder: Path, seed: int, document: dict[str, Any], made: Plan, batch: SeedBatch
+) -> Learned:
+    """What the agent's file of a seed holds; BcrlError unless the run wrote it."""
+    path = seed_path(folder, seed, AGENT)
+    if not path.exists():
+        why = document.get("no_agent", "it was removed")
+        todo = f"delete {path.with_suffix('')}.* and run again with keep=final"
+        raise BcrlError(f"{path} is missing: {why}; {todo}")
+    size = len(read_recorded(path, document))
+    if (about := serialization.read_about(path)).get("schema") != AGENT_SCHEMA:
+        what = f"has schema {about.get('schema')!r} of bcrl {about.get('bcrl')}"
+        raise BcrlError(f"{path} {what}; bcrl {__version__} reads {AGENT_SCHEMA}")
+    regressors = (getattr(stage.learner, "regressor", None) for stage in made.stages)
+    trees = max(getattr(regressor, "trees", 0) for regressor in regressors)
+    if (needed := _PER_BYTE * size * trees) > (there := available()):
+        what = f"{path} needs up to {needed / 2**30:.0f} GiB of memory for its trees"
+        raise BcrlError(f"{what}, but there are {there / 2**30:.0f}")
+    own = serialization.read_content(path, given(made.all_stages, batch))
+    if not isinstance(own, Learned) or about.get("seed") != seed:
+        raise BcrlError(f"{path} holds no agent of seed {seed}; remove it")
+    return own
+
+
+def document_of(folder: Path, seed: int) -> dict[str, Any]:
+    """A complete seed's JSON; BcrlError says which seeds there are."""
+    if not folder.is_dir():
+        why = "is no folder; name one such as runs/quick/maze/BC-FQI"
+        raise BcrlError(f"{folder} {why}")
+    seeds = recorded_seeds(folder, "json")
+    if seed not in seeds:
+        there = f"seeds {spelled(seeds)}" if seeds else "no seeds"
+        raise BcrlError(f"{folder} has no seed {seed}; there are {there}")
+    document = read_document(folder, seed)
+    if document["status"] != COMPLETE:
+        why = f'says "{document["status"]}"; run its command to the end'
+        raise BcrlError(f"{seed_path(folder, seed, 'json')} {why}")
+    return document

@@ -1,0 +1,131 @@
+"""`bcrl-eval`: episodes of the agents that a run has left, in its tasks or others."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import yaml
+
+from bcrl import __version__
+from bcrl.common.checks import construct
+from bcrl.common.files import write_text
+from bcrl.common.seeding import stream
+from bcrl.common.terminal import ready, say, show
+from bcrl.envs import Env, tasks_of
+from bcrl.errors import BcrlError
+from bcrl.learning.agent import Agent
+from bcrl.learning.rollout import CHOICES, Episodes, play, starts_and_draws, success_of
+from bcrl.results.layout import recorded_seeds
+from bcrl.run.agents import load
+
+_ABOUT = """Play greedy episodes with the agents of a run, write one row per episode to
+a CSV and print the returns. Words such as env.mass=1.4 change the task."""
+
+
+def episodes(agent: Agent, env: Env, n: int) -> Episodes:
+    """n greedy episodes of an agent in a task; they depend on its seed alone."""
+    rngs = [stream(agent.seed, "agent")]
+    start, u = starts_and_draws(rngs, env, n, CHOICES)
+    played = play(env, agent.choose, start, u)
+    for why in played.failed.values():
+        raise BcrlError(f"seed {agent.seed}: {why}")
+    return played
+
+
+def table(agent: Agent, env: Env, played: Episodes) -> pd.DataFrame:
+    """A row per episode: seed, episode, its returns, whether it solved, its steps."""
+    columns = {
+        "return": played.reward[0].sum(-1),
+        "discounted_return": played.discounted_return(env.gamma)[0],
+        "solved": played.solved(success_of(env))[0].astype(int),
+        "steps": played.length[0],
+    }
+    frame = pd.DataFrame(columns)
+    frame.insert(0, "episode", np.arange(len(frame)))
+    frame.insert(0, "seed", agent.seed)
+    return frame
+
+
+def changed(task: Env, words: Sequence[str]) -> Env:
+    """A task with other constants: env.mass=1.4, env.kwargs.gravity=5."""
+    values: dict[str, Any] = {
+        field.name: getattr(task, field.name) for field in fields(task) if field.init
+    }
+    for word in words:
+        key, equals, text = word.partition("=")
+        section, _, name = key.partition(".")
+        if section != "env" or not name or not equals:
+            raise BcrlError(f"{word}: unknown; env.KEY=VALUE changes the task")
+        *above, last = name.split(".")
+        place = values
+        for part in above:
+            place[part] = dict(place.get(part) or {})
+            place = place[part]
+        place[last] = yaml.safe_load(text)
+    return construct("env", type(task), values)
+
+
+def _task(agent: Agent, number: int | None, words: Sequence[str]) -> Env:
+    """The task to play: the run's target, or another one of its tasks, changed."""
+    tasks = tasks_of(agent.config["env"])
+    if number is not None and not 1 <= number <= len(tasks):
+        raise BcrlError(f"--task {number}: the run has tasks 1 to {len(tasks)}")
+    task = tasks[-1 if number is None else number - 1]
+    env = changed(task, words) if words else task
+    for name in ("state_dim", "n_actions"):
+        if (new := getattr(env, name)) != (old := getattr(agent.task, name)):
+            raise BcrlError(f"the task's {name} is {new}, but the agent's is {old}")
+    return env
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Console entry point; 2 for bad input."""
+    ready()
+    try:
+        _evaluate(_parser().parse_intermixed_args(arguments))
+    except BcrlError as error:
+        say(f"bcrl-eval: {error}")
+        return 2
+    return 0
+
+
+def _evaluate(asked: argparse.Namespace) -> None:
+    if asked.episodes < 1:
+        raise BcrlError(f"--episodes {asked.episodes}: must be at least 1")
+    seeds = asked.seed or recorded_seeds(asked.run, "agent")
+    if not seeds:
+        raise BcrlError(f"{asked.run} has no agents; name a folder that a run has made")
+    found = []
+    for seed in seeds:
+        agent = load(asked.run, seed, trust=asked.trust)
+        env = _task(agent, asked.task, asked.overrides)
+        found.append(table(agent, env, episodes(agent, env, asked.episodes)))
+    whole = pd.concat(found, ignore_index=True)
+    path = asked.out or asked.run / "evaluation.csv"
+    write_text(path, whole.to_csv(index=False))
+    each = whole.groupby("seed")[["return", "discounted_return", "solved"]].mean()
+    show(each.round(4).to_string())
+    show(f"{len(whole)} episodes in {path}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="bcrl-eval", description=_ABOUT)
+    add = parser.add_argument
+    add("run", type=Path, metavar="RUN", help="the folder of a variant's results")
+    add("overrides", nargs="*", metavar="env.KEY=VALUE", help="constants of the task")
+    add("--episodes", type=int, default=100, help="of each seed; default: %(default)s")
+    add("--seed", type=int, action="append", help="only this one; may be repeated")
+    add("--task", type=int, help="number of the run's task, from 1; default: the last")
+    add("--out", type=Path, metavar="CSV", help="default: RUN/evaluation.csv")
+    add("--trust", action="append", default=[], metavar="PACKAGE", help="of your own")
+    add("--version", action="version", version=f"bcrl {__version__}")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,117 @@
+"""A longer run continues a shorter one from its kept states (`keep=state`).
+
+A state is a checkpoint of a complete run. It becomes a checkpoint of the longer run,
+which then resumes as after an interruption.
+"""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bcrl.common import serialization
+from bcrl.common.files import write_atomically, write_bytes
+from bcrl.config.plan import Plan, plan
+from bcrl.errors import ConfigError
+from bcrl.learning.stage import CurriculumRun
+from bcrl.results.layout import STATE, recorded_seeds, spelled
+from bcrl.results.read import read_document
+from bcrl.run import checkpoints, records
+
+#: Learner → the setting that makes it learn longer.
+_LENGTHS = {"fqi": "iterations", "dqn": "steps"}
+
+
+def keep(plan: Plan, run: CurriculumRun, content: dict[str, Any]) -> None:
+    """Write the state from which a longer run can go on; `content`: a checkpoint's."""
+    learner: Any = plan.stages[-1].learner
+    if learner.name not in _LENGTHS:
+        return
+    rows = json.loads(content["rows"])
+    if getattr(learner, _LENGTHS[learner.name]) % learner.evaluate_every:
+        rows = [own[:-1] for own in rows]  # a longer run does not evaluate there
+    content |= {"rows": json.dumps(rows), "kept": content["kept"][:-1]}
+    content |= {"residuals": content["residuals"][:-1]}
+    seeds = run.batch.seeds
+    path = checkpoints.checkpoint_path(plan, seeds, STATE)
+    about = checkpoints.about_of(plan) | {"seeds": list(seeds)}
+    given = run.given
+    write_atomically(path, lambda to: serialization.write(to, about, content, given))
+
+
+def adopt(longer: Plan) -> None:
+    """Make the kept states of the run `extend` names the plan's own checkpoints.
+
+    Raises BcrlError if that run can't be extended to the plan, or kept no states.
+    """
+    if (named := longer.config["extend"]) is None:
+        return
+    begun = [seed for batch in checkpoints.batches(longer) for seed in batch]
+    pending = set(records.pending(longer)) - set(begun)
+    if not pending:
+        return
+    folder = Path(named).absolute()
+    shorter = _plan(folder)
+    _check(longer, shorter, named)
+    records.make_run_directory(longer)
+    found, about = checkpoints.stored(folder, STATE), checkpoints.about_of(shorter)
+    for path, own in found.items():
+        seeds = tuple(own.pop("seeds", ()))
+        if own == about and pending.issuperset(seeds):
+            label = checkpoints.about_of(longer) | {"seeds": list(seeds)}
+            data = serialization.relabelled(path, label)
+            write_bytes(checkpoints.checkpoint_path(longer, seeds), data)
+            pending -= set(seeds)
+    if pending:
+        _refuse(longer, folder, sorted(pending), bool(found))
+
+
+def _plan(folder: Path) -> Plan:
+    """The plan of the run in a folder."""
+    seeds = recorded_seeds(folder, "json")
+    if not seeds:
+        why = "holds no run; name one such as runs/quick/maze/BC-FQI"
+        raise ConfigError("extend", str(folder), why)
+    document = read_document(folder, seeds[0])
+    return plan(document["config"], document["env"], document["tag"])
+
+
+def _check(longer: Plan, shorter: Plan, named: str) -> None:
+    """Raise ConfigError unless one is the other with a longer last stage."""
+    old, new = (_parts(each) for each in (shorter, longer))
+    learner: Any = longer.stages[-1].learner
+    length, why = _LENGTHS.get(learner.name), ""
+    if length is None:
+        why = f"ends with {learner.name}; only FQI and DQN go on from a state"
+    elif old[0] != new[0]:
+        why = "has other tasks, metrics or stages; only the last stage may be longer"
+    elif other := [k for k in new[1] if new[1][k] != old[1].get(k) and k != length]:
+        key, value = other[0], old[1].get(other[0])
+        why = f"has {key}={value}, this run {new[1][key]}; only {length} may differ"
+        why += f" (add algorithm.{key}={value})"
+    elif new[1][length] <= old[1][length]:
+        why = f"has {old[1][length]} {length}, this run {new[1][length]}: ask for more"
+    if why:
+        raise ConfigError("extend", named, why)
+
+
+def _parts(plan: Plan) -> tuple[tuple, dict[str, Any]]:
+    """What must be equal, and the settings of the last stage's learner."""
+    last = plan.stages[-1]
+    whole = plan.tasks, plan.metrics, plan.stages[:-1], type(last.learner)
+    return (*whole, last.task, last.env, last.transfers, last.before), vars(
+        last.learner
+    )
+
+
+def _refuse(longer: Plan, folder: Path, seeds: Sequence[int], found: bool) -> None:
+    """Raise ConfigError: no state of these seeds; what they cost if they start anew."""
+    spent = [
+        records.read_facts(folder, seed).get("cpu_seconds", 0.0)
+        for seed in recorded_seeds(folder, "json")
+    ]
+    why = f"keeps no state of seeds {spelled(seeds)} "
+    why += "(of this version and device)" if found else "(its run had no keep=state)"
+    cost = max(spent, default=0.0) / 60
+    why += f"; without extend= they start anew, for more than {cost:.1f} core-minutes "
+    raise ConfigError("extend", str(folder), f"{why}each")
