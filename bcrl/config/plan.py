@@ -1,7 +1,7 @@
 """From a composed configuration to a plan: stages, transfers, variant, directory."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ class Plan:
     config: Plain  # resolved, whole
     sources: str = ""  # a digest of the user's code that it runs
     command: str = ""  # what runs this plan alone, a line each if there are several
+    settings: Plain = field(default_factory=dict)  # that the tag stands for
     launcher: Plain | None = None  # of Slurm's parameters, if its jobs run this
 
     @property

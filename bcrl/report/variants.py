@@ -9,10 +9,10 @@ import numpy as np
 
 from bcrl.common.divergence import diverging
 from bcrl.results.layout import seed_path, spelled
+from bcrl.results.outcomes import late_rows
 from bcrl.results.read import read_arrays
 
 LINEAR = "linear_system"
-WINDOW = 5000  # environment steps before a run's end whose evaluations are averaged
 #: The methods of each family, in the order of the legends.
 METHODS = ("FQI", "C-FQI", "B-FQI", "BC-FQI")
 _DQN = "DQN C-DQN B-DQN BC-DQN S-DQN SC-DQN SB-DQN SBC-DQN RPL PPR"
@@ -91,8 +91,7 @@ class Variant:
 
     def late(self, metric: str) -> np.ndarray:
         """Every seed's mean over the target's evaluations in the last WINDOW steps."""
-        rows = self.target_rows
-        rows = rows[self.index[rows] > self.index[-1] - WINDOW]
+        rows = late_rows(self.task, self.index)
         return self.metrics[metric][:, rows].mean(axis=1)
 
     def area(self, metric: str) -> np.ndarray:

@@ -4,11 +4,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from bcrl.common.text import number
 from bcrl.errors import BcrlError
 from bcrl.report.figures import style
 from bcrl.report.figures.linear import figure_4a, figure_4b, pretraining, prior
 from bcrl.report.load import load_runs
-from bcrl.report.tables import number, sweep_sections, sweep_table
+from bcrl.report.tables import sweep_sections, sweep_table
 from tests.report.runs import SEVEN, claims_of, csv_of, report, verdicts_of, write_dqn
 from tests.results.made_up import edit_csv, made_up_plan, reseal, write_seeds
 

@@ -10,13 +10,13 @@ import pytest
 from scipy import stats
 
 from bcrl.errors import BcrlError
-from bcrl.report import statistics as st
 from bcrl.report.claims import verdict
 from bcrl.report.figures import curves, style
 from bcrl.report.figures.maze import figure_3, seed_mean_value
 from bcrl.report.load import load_runs
 from bcrl.report.tables import aggregate
 from bcrl.report.variants import METHODS, remarks
+from bcrl.results import statistics as st
 from bcrl.results.layout import FQI_METRICS, seed_path
 from tests.report.runs import (
     as_claimed,

@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bcrl.report.figures import style
-from bcrl.report.statistics import bootstrap_curves, standard_error
 from bcrl.report.variants import Methods, Runs, Variant
+from bcrl.results.statistics import bootstrap_curves, standard_error
 
 POINTS = 300  # of a curve that are drawn, about
 _COLUMNS = 3  # panels beside each other
