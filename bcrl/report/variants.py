@@ -89,10 +89,21 @@ class Variant:
         """A metric at the last evaluation, (S,)."""
         return self.metrics[metric][:, -1]
 
+    @property
+    def late_rows(self) -> np.ndarray:
+        """Rows of the target in a run's last WINDOW environment steps, (L,)."""
+        return late_rows(self.task, self.index)
+
     def late(self, metric: str) -> np.ndarray:
-        """Every seed's mean over the target's evaluations in the last WINDOW steps."""
-        rows = late_rows(self.task, self.index)
-        return self.metrics[metric][:, rows].mean(axis=1)
+        """Every seed's mean over the `late_rows`, (S,)."""
+        return self.metrics[metric][:, self.late_rows].mean(axis=1)
+
+    def final(self, metric: str) -> np.ndarray:
+        """What a run ends with, (S,): the last value or, in the DQN family, a mean over
+        the `late_rows` that have one; nan where there is none."""
+        rows = self.late_rows if self.family == "DQN" else [-1]
+        values = np.ma.masked_invalid(self.metrics[metric][:, rows])
+        return np.asarray(values.mean(axis=1).filled(np.nan))
 
     def area(self, metric: str) -> np.ndarray:
         """Every seed's mean over all evaluations in the target, (S,)."""
@@ -163,7 +174,9 @@ def listed(items: Iterable[object]) -> str:
 
 def tags_shown(methods: Methods) -> str:
     """`variants @released`, or whose: `@released: BC-DQN, SC-DQN`."""
-    tagged = {name: v.tag for name, v in methods.items() if v.tag}
+    tagged = {name: v.tag for name, v in methods.items() if v.tag and v.tag not in name}
+    if len(set(tagged.values())) > 1:
+        return ""
     (tag,) = set(tagged.values()) or {""}
     if len(tagged) in (0, len(methods)):
         return f"variants @{tag}" if tag else ""
@@ -175,9 +188,10 @@ def remarks(runs: Runs, methods: Methods, compares: bool = True) -> list[str]:
     `compares`: differences between methods belong to it too."""
     env, family = next((v.env, v.family) for v in methods.values())
     tags = {v.tag for v in methods.values()}
+    drawn = {(v.method, v.tag) for v in methods.values()}
 
     def belongs(note: Note) -> bool:
-        if note.method in methods and methods[note.method].tag == note.tag:
+        if (note.method, note.tag) in drawn:
             return True
         if note.method:  # it isn't drawn: perhaps it has no complete seed
             awaited = note.method in COMPARED.get((env, family), ())

@@ -76,7 +76,7 @@ def test_curves_are_the_means_of_the_records(tmp_path):
     """Each method's line covers its target rows only, at steps of all stages."""
     write_dqn(tmp_path)
     left, right = figure_4a(load_runs(tmp_path, "smoke")).axes
-    lines = {x.get_color(): x for x in left.lines if x.get_linewidth() > 1.5}
+    lines = {x.get_color(): x for x in left.lines if x.get_linewidth() > 1.2}
     paths = csv_of(tmp_path, "C-DQN", 0).parent.glob("*.csv")
     tables = [pd.read_csv(path) for path in paths]
     target = tables[0]["stage"] == 2
