@@ -11,12 +11,11 @@ from bcrl.common.identity import Plain
 from bcrl.config.algorithms import algorithm
 from bcrl.config.rules import check_numbers
 from bcrl.config.schema import Choice, Config, check_name, check_path
-from bcrl.config.variant import Composition, composition
+from bcrl.config.variant import composition, method_name
 from bcrl.envs import Env, check_tasks, tasks_of
 from bcrl.errors import ConfigError, did_you_mean
 from bcrl.evaluation.metrics import check_metrics
 from bcrl.learning.stage import Stage
-from bcrl.learning.transfer import PolicyReuse, ResidualPolicy, Shape
 from bcrl.results.loggers import logger
 
 LOCKSTEP_ON_GPU = 500  # seeds: a step takes little longer than that of 100
@@ -82,7 +81,9 @@ def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
     own_lockstep = LOCKSTEP_ON_GPU if device == "cuda" else module.LOCKSTEP
     return Plan(
         env=env,
-        variant=_variant(config["algorithm"]["name"], chosen),
+        variant=method_name(
+            config["algorithm"]["name"], chosen.transfers, chosen.target_only
+        ),
         tag=tag,
         family=module.FAMILY,
         stages=stages,
@@ -119,20 +120,6 @@ def part(seeds: tuple[int, ...], which: str | None) -> tuple[int, ...]:
         why = f"must be K/N, the K-th of at most {len(seeds)} parts, such as 1/2"
         raise ConfigError("seeds.part", which, why)
     return seeds[(number - 1) * len(seeds) // parts : number * len(seeds) // parts]
-
-
-def _variant(algorithm_name: str, chosen: Composition) -> str:
-    """`SBC-DQN` and the like; policy reuse and residual policy by their own names."""
-    transfer = chosen.transfer
-    prefix = "S" * isinstance(transfer, Shape) + "B" * (chosen.boost is not None)
-    prefix += "C" * (not chosen.target_only)
-    whole = f"{prefix}-{algorithm_name.rpartition('.')[2].upper()}".lstrip("-")
-    if isinstance(transfer, ResidualPolicy):
-        return "RPL"
-    if isinstance(transfer, PolicyReuse):
-        return f"PPR-{whole}" if chosen.boost else "PPR"
-    own = transfer is not None and not isinstance(transfer, Shape)
-    return f"{type(transfer).__name__}-{whole}" if own else whole
 
 
 def usable_device(wanted: str, family: str) -> str:
