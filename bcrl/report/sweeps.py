@@ -26,6 +26,10 @@ class Sweep:
         """The variants by their values as text, `32` or `32, 1e-3`."""
         return {", ".join(map(text_of, each)): v for each, v in self.variants.items()}
 
+    def records(self, metric: str) -> bool:
+        """Whether all variants record a metric."""
+        return all(metric in variant.metrics for variant in self.variants.values())
+
     def steps(self, place: int) -> list[Any]:
         """The values of a key, in order."""
         return ordered({values[place] for values in self.variants})
@@ -35,8 +39,8 @@ def sweeps_of(variants: Sequence[Variant], keys: Sequence[str]) -> list[Sweep]:
     """What differs in `keys` only, per method and other settings. BcrlError if nothing
     does, with the keys in which the variants differ."""
     groups: dict[tuple[str, str], dict[Values, Variant]] = {}
-    settings = [flat(identity(variant.config)) for variant in variants]
-    for variant, mine in zip(variants, settings, strict=True):
+    for variant in variants:
+        mine = flat(identity(variant.config))
         if not all(key in mine for key in keys):
             continue
         rest = {key: value for key, value in mine.items() if key not in keys}
@@ -50,7 +54,7 @@ def sweeps_of(variants: Sequence[Variant], keys: Sequence[str]) -> list[Sweep]:
         group[values] = variant
     found = {k: group for k, group in groups.items() if _varies(group, len(keys))}
     if not found:
-        raise BcrlError(_nothing(settings, keys))
+        raise BcrlError(_nothing(variants, keys))
     return [
         Sweep(name, tuple(keys), {each: group[each] for each in ordered(group)})
         for name, group in zip(_labels(list(found)), found.values(), strict=True)
@@ -62,12 +66,15 @@ def _varies(group: Mapping[Values, Variant], keys: int) -> bool:
     return all(len({values[place] for values in group}) > 1 for place in range(keys))
 
 
-def _nothing(settings: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> str:
+def _nothing(variants: Sequence[Variant], keys: Sequence[str]) -> str:
     """Why there is no sweep of these keys."""
-    known = set().union(*settings)
-    differing = sorted(
-        key for key in known if len({as_text(each.get(key)) for each in settings}) > 1
-    )
+    settings = [(v.method, flat(identity(v.config))) for v in variants]
+    known = {key for _, mine in settings for key in mine}
+    values: dict[tuple[str, str], set[str]] = {}
+    for method, mine in settings:
+        for key in known:
+            values.setdefault((key, method), set()).add(as_text(mine.get(key)))
+    differing = sorted({key for (key, _), found in values.items() if len(found) > 1})
     for key in keys:
         if key not in known:
             return f"--sweep {key}: no variant has it; {did_you_mean(key, differing)}"
