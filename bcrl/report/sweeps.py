@@ -1,6 +1,7 @@
 """Sweeps: variants of a method that differ in one or two chosen keys only."""
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -55,10 +56,11 @@ def sweeps_of(variants: Sequence[Variant], keys: Sequence[str]) -> list[Sweep]:
     found = {k: group for k, group in groups.items() if _varies(group, len(keys))}
     if not found:
         raise BcrlError(_nothing(variants, keys))
-    return [
+    sweeps = [
         Sweep(name, tuple(keys), {each: group[each] for each in ordered(group)})
         for name, group in zip(_labels(list(found)), found.values(), strict=True)
     ]
+    return sorted(sweeps, key=lambda sweep: _natural(sweep.label))
 
 
 def _varies(group: Mapping[Values, Variant], keys: int) -> bool:
@@ -96,6 +98,12 @@ def _labels(groups: Sequence[tuple[str, str]]) -> list[str]:
         }
         found.append(", ".join([method, *(f"{k}={v}" for k, v in told.items())]))
     return found
+
+
+def _natural(label: str) -> list[int | str]:
+    """What orders labels so that 5 comes before 10."""
+    parts = re.split(r"(\d+)", label)
+    return [int(part) if part.isdecimal() else part for part in parts]
 
 
 def _hashable(value: Any) -> Any:
