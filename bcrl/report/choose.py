@@ -128,7 +128,7 @@ def _chosen_metrics(methods: Methods, names: Sequence[str] | None) -> list[str]:
     families = {variant.family: label for label, variant in methods.items()}
     if len(families) > 1:
         both = ", ".join(f"{label} ({family})" for family, label in families.items())
-        why = "their curves count iterations and steps; draw the families in separate figures"
+        why = "they count iterations and steps; draw the families in separate figures"
         raise BcrlError(f"--compare: {both}: {why}")
     known = metrics_of(methods)
     for name in names or ():

@@ -10,7 +10,7 @@ from bcrl.common.identity import as_text, flat, identity
 from bcrl.errors import BcrlError, did_you_mean
 from bcrl.report.variants import Methods, Variant, listed
 
-Values = tuple[Any, ...]  # a value per swept key
+SweptValues = tuple[Any, ...]  # a value per swept key
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Sweep:
 
     label: str
     keys: tuple[str, ...]
-    variants: Mapping[Values, Variant]
+    variants: Mapping[SweptValues, Variant]
 
     @property
     def methods(self) -> Methods:
@@ -33,13 +33,13 @@ class Sweep:
 
     def steps(self, place: int) -> list[Any]:
         """The values of a key, in order."""
-        return ordered({values[place] for values in self.variants})
+        return sorted_values({values[place] for values in self.variants})
 
 
 def sweeps_of(variants: Sequence[Variant], keys: Sequence[str]) -> list[Sweep]:
     """What differs in `keys` only, per method and other settings. BcrlError if nothing
     does, with the keys in which the variants differ."""
-    groups: dict[tuple[str, str], dict[Values, Variant]] = {}
+    groups: dict[tuple[str, str], dict[SweptValues, Variant]] = {}
     for variant in variants:
         mine = flat(identity(variant.config))
         if not all(key in mine for key in keys):
@@ -57,13 +57,13 @@ def sweeps_of(variants: Sequence[Variant], keys: Sequence[str]) -> list[Sweep]:
     if not found:
         raise BcrlError(_nothing(variants, keys))
     sweeps = [
-        Sweep(name, tuple(keys), {each: group[each] for each in ordered(group)})
+        Sweep(name, tuple(keys), {each: group[each] for each in sorted_values(group)})
         for name, group in zip(_labels(list(found)), found.values(), strict=True)
     ]
     return sorted(sweeps, key=lambda sweep: _natural(sweep.label))
 
 
-def _varies(group: Mapping[Values, Variant], keys: int) -> bool:
+def _varies(group: Mapping[SweptValues, Variant], keys: int) -> bool:
     """Whether each key has several values."""
     return all(len({values[place] for values in group}) > 1 for place in range(keys))
 
@@ -121,7 +121,7 @@ def is_numeric(values: Sequence[Any]) -> bool:
     return all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
 
 
-def ordered(values: Any) -> list[Any]:
+def sorted_values(values: Any) -> list[Any]:
     """By size where the values are numbers, else by their text."""
 
     def key(value: Any) -> Any:
