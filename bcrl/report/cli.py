@@ -151,8 +151,8 @@ def _draw_chosen(options: Namespace, how: Print) -> int:
     """Draw what --compare and --sweep ask for."""
     for name, usual in _NOT_CHOOSING.items():
         if getattr(options, name) != usual:
-            text = "does not go with --compare and --sweep"
-            raise BcrlError(f"--{name}: {text}; name variants as BC-FQI@released")
+            text = "cannot be combined with --compare or --sweep"
+            raise BcrlError(f"--{name}: {text}; name a tagged variant BC-FQI@TAG")
     out = options.out or options.runs_dir / "figures"
     make_directory(out, "--out")
     with style.sheet():
@@ -173,7 +173,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _draw_chosen(options, how)
         if alone := [name for name in _CHOOSING if getattr(options, name)]:
             flag = f"--{alone[0].replace('_', '-')}"
-            raise BcrlError(f"{flag}: goes with --compare or --sweep only")
+            raise BcrlError(f"{flag}: needs --compare or --sweep")
         chosen = [*FIGURES, CURVES] if "all" in options.figures else options.figures
         runs = load_runs(options.runs_dir, options.scale, options.allow_incomplete)
         for note in runs.notes:

@@ -52,9 +52,6 @@ def load_chosen(folders: Sequence[Path], allow_incomplete: bool = False) -> Runs
     variants = tuple(filter(None, [_variant(each, notes) for each in checked]))
     if not variants:
         raise BcrlError("; ".join(["no complete runs", *(note.text for note in notes)]))
-    methods, family = {v.name: v for v in variants}, variants[0].family
-    if len(tags := {v.tag for v in variants}) == 1:
-        notes += across_methods(methods, methods, variants[0].env, *tags, family)
     scales = dict.fromkeys(folder.resolve().parts[-3] for folder in folders)
     return Runs(listed(scales), variants, notes)
 

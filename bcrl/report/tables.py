@@ -65,7 +65,7 @@ def aggregate(runs: Runs, family: str = "FQI") -> pd.DataFrame:
         for metric, values in variant.metrics.items():
             block = index | {"metric": metric, "seeds": len(variant.seeds)}
             block["mean"] = values.mean(axis=0)
-            block["standard_error"] = standard_error(values, ddof=1)
+            block["standard_error"] = standard_error(values)
             blocks.append(pd.DataFrame(block))
     return pd.concat(blocks, ignore_index=True)
 

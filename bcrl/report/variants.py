@@ -199,7 +199,7 @@ def remarks(runs: Runs, methods: Methods, compares: bool = True) -> list[str]:
         return compares and note.family == family and {note.tag} == tags
 
     shown = [note for note in runs.notes if note.env == env and belongs(note)]
-    if compares and len(tags) > 1:  # no notes were made for such a mixture yet
+    if compares and not any(note.family for note in shown):  # as of a mixture of tags
         shown += across_methods(methods, methods, env, None, family)
     odd = "; ".join(n.footer for n in shown if n.footer and not n.incomplete)
     return list(filter(None, [incomplete(shown), odd and f"Note: {odd}"]))
@@ -216,7 +216,7 @@ def across_methods(
 ) -> list[Note]:
     """Notes on compared methods that are absent or that differ in seeds or length. In
     the DQN family lengths differ by design and aren't compared."""
-    variants, suffix = methods.values(), f"@{tag}" if tag else ""
+    suffix = f"@{tag}" if tag else ""
     absent = [f"{name}{suffix}" for name in expected if name not in methods]
     found = [f"no runs of {listed(absent)}"] if absent else []
     compared = {"seeds": lambda v: spelled(v.seeds), "optima": lambda v: v.optimum}
@@ -224,8 +224,9 @@ def across_methods(
         compared["iterations"] = lambda v: len(v.stage)
     for what, value_of in compared.items():
         groups: dict[object, list[str]] = {}
-        for variant in variants:
-            groups.setdefault(value_of(variant), []).append(variant.name)
+        for label, variant in methods.items():
+            name = label if label.startswith(variant.name) else variant.name
+            groups.setdefault(value_of(variant), []).append(name)
         if len(groups.keys() - {None}) > 1:
             texts = [f"{value}: {listed(names)}" for value, names in groups.items()]
             found.append(f"{what} differ: {'; '.join(texts)}")

@@ -167,7 +167,7 @@ def save_figure(
     figure: Figure, folder: Path, name: str, title: str, how: Print | None = None
 ) -> list[Path]:
     """Write `name`.png and so on, atomically, without a date inside, all of one size.
-    Where the caption is a file of its own, remarks stay in the figure, too."""
+    Where the caption is a text file, remarks stay in the figure, too."""
     how = how or Print()
     software, text, files = f"bcrl {__version__}", figure.get_label(), []
     about = {

@@ -159,5 +159,7 @@ def figure_4b(runs: Runs, tag: str | None = None, width: float = layout.TEXT) ->
     _draw_environment(panels[2], variant)
     shown = {v.method: v for v in found.values()} or {variant.method: variant}
     what = "one seed per panel, own colour scales; arrows: greedy action at zero "
-    what += "velocity; target: walls reflect, off the pathway one is put back"
+    what += (
+        "velocity; target: walls reflect, an agent off the pathway returns to its start"
+    )
     return layout.caption(figure, runs, shown, what, compares=False)

@@ -11,7 +11,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from bcrl.report.figures import curves, layout, style
-from bcrl.report.sweeps import Sweep, is_numeric, ordered, text_of
+from bcrl.report.sweeps import Sweep, is_numeric, sorted_values, text_of
 from bcrl.report.variants import Methods, Runs
 from bcrl.results.outcomes import WINDOW
 from bcrl.results.statistics import bootstrap
@@ -67,7 +67,7 @@ def figure_final(
     """What the runs end with against the one key that is swept, a line per sweep."""
     figure, (axes,) = layout.panels(1, width)
     (key,), family = sweeps[0].keys, next(iter(sweeps[0].variants.values())).family
-    values = ordered({value for sweep in sweeps for value in sweep.steps(0)})
+    values = sorted_values({value for sweep in sweeps for value in sweep.steps(0)})
     numeric, lines = is_numeric(values), style.lines_of([s.label for s in sweeps])
     for sweep in sweeps:
         steps = sweep.steps(0)
