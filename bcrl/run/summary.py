@@ -15,6 +15,7 @@ from bcrl.results.read import Finding
 from bcrl.run import records
 
 _LISTED = 20  # variants, and lines about tags
+_COMPARED = 8  # variants that one figure can compare
 
 
 def summary(plans: Sequence[Plan], seconds: float) -> str:
@@ -69,8 +70,11 @@ def _next(plans: Sequence[Plan]) -> str:
     if str(plans[0].root) != "runs":
         words.append(f"runs_dir={plans[0].root}")
     tagged = {plan.tag for plan in plans}
-    if len(tagged) == 1 and None not in tagged:
-        words += ["--tag", *tagged]
+    alike = len({(plan.env, plan.family) for plan in plans}) == 1
+    if len(tagged) == 1:
+        words += ["--tag", *tagged] if None not in tagged else []
+    elif alike and len(plans) <= _COMPARED:
+        words += ["--env", plans[0].env, "--compare", *(plan.name for plan in plans)]
     if any(records.pending(plan, plan.asked) for plan in plans):
         words.append("--allow-incomplete")
     return f"next: {shlex.join(words)}"

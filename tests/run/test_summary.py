@@ -9,6 +9,7 @@ import pytest
 
 from bcrl.config import tags
 from bcrl.report import cli as report
+from bcrl.report.choose import folders_of
 from bcrl.report.load import load_runs
 from bcrl.report.tables import sweep_table
 from bcrl.results.outcomes import outcome
@@ -104,7 +105,8 @@ def test_a_run_ends_with_what_it_achieved_and_the_next_command(tmp_path, capsys)
     command = shlex.split(text.splitlines()[-1].removeprefix("next: "))
     asked = report._parser().parsed(command[1:])
     assert command[0] == "bcrl-report" and not asked.allow_incomplete
-    assert len(load_runs(asked.runs_dir, asked.scale).variants) == 4
+    found = folders_of(asked.runs_dir, asked.scale, asked.env, asked.compare)
+    assert found == [each.directory.resolve() for each in swept]
 
 
 def test_nothing_is_shown_without_progress(tmp_path, capsys):
@@ -151,3 +153,14 @@ def test_one_tag_with_two_meanings_is_told_apart_by_the_folder():
     assert found == ["maze FQI@t: a.b=FQI@t", "maze C-FQI@t: a.b=C-FQI@t"]
     (line,) = tags.meanings({folders[0]: {"k": list(range(99)), "gone": "absent"}})
     assert len(line) < 80 and line.endswith("…") and "gone" not in line
+
+
+def test_the_next_command_draws_the_runs(tmp_path):
+    def following(*names: str) -> list[str]:
+        plans = [made_up_plan(tmp_path, "maze", name, range(0)) for name in names]
+        return shlex.split(summary(plans, 1.0).splitlines()[-1])[5:]
+
+    assert following("FQI", "BC-FQI") == []
+    assert following("FQI@t", "BC-FQI@t") == ["--tag", "t"]
+    assert following("FQI", "FQI@t") == ["--env", "maze", "--compare", "FQI", "FQI@t"]
+    assert following(*(f"FQI@{number}" for number in range(9))) == []
