@@ -40,6 +40,7 @@ from bcrl.learning.transfer import Boost, PolicyReuse, ResidualPolicy, Shape, wa
 from bcrl.q.regressors.ours import ForestRegressor as Forest
 from bcrl.q.regressors.ours import Tabular
 from bcrl.q.regressors.scikit import Sklearn
+from bcrl.results.layout import INDEX
 from bcrl.results.tables import read_results as read
 from bcrl.run.frame import SeedGroup, SeedRows, about, train_groups
 from bcrl.run.workers import cores
@@ -152,18 +153,18 @@ def run(
     whole = all(isinstance(seed, Integral) and seed >= 0 for seed in seeds)
     if not whole or not 0 < len(seeds) == len(set(seeds)):
         raise ConfigError("seeds", seeds, "must be different whole numbers from 0 on")
-    if isinstance(last.learner, FQI):
+    family = "FQI" if isinstance(last.learner, FQI) else "DQN"
+    if family == "FQI":
         fqi_metrics.check_metrics(metrics, last.env)
     _check_how(workers, threads, save, on_row)
-    device = usable_device(device, "FQI" if isinstance(last.learner, FQI) else "DQN")
+    device = usable_device(device, family)
     groups = np.array_split(np.arange(len(seeds)), min(workers, len(seeds)))
     threads = threads or max(1, cores() // len(groups))
     method, settings = about(stages)
     rows: list[tuple[int, int, dict[str, Any]]] = []  # evaluation, seed's place, row
     done, evaluations = [0] * len(groups), [0] * len(groups)
     length = sum(stage.learner.length for stage in stages)
-    unit = "iteration" if isinstance(last.learner, FQI) else "step"
-    with tqdm(total=length, unit=unit, disable=not progress) as bar:
+    with tqdm(total=length, unit=INDEX[family][-1], disable=not progress) as bar:
 
         def take(group: int, measured: tuple[int, int, SeedRows]) -> None:
             done[group], task, found = measured

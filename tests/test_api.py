@@ -100,7 +100,7 @@ class Wrong(Tabular):
 @pytest.mark.slow
 def test_a_failure_in_a_process_ends_the_call():
     course = api.stages([Maze()], replace(FAST, regressor=Wrong()))
-    with pytest.raises(BcrlError, match=r"seed 0: .*ZeroDivisionError: no"):
+    with pytest.raises(BcrlError, match=r"seed [01]: .*ZeroDivisionError: no"):
         trained(course, workers=2)
 
     def stop(row: dict) -> None:
@@ -227,6 +227,9 @@ def test_frames_of_several_calls_are_drawn_together():
         "BC-FQI episodes=20, epsilon=0.5",
         "C-FQI",
     ]
+    warm = trained(api.stages([Maze()], replace(FAST, evaluate_every=2)))
+    rare = pd.concat([trained(api.stages([Maze()], FAST)), warm])
+    assert [*curves(api.plot(rare))] == ["FQI", "FQI evaluate_every=2"]
     mine = trained().assign(method="mine").drop(columns="learner.episodes")
     assert [*curves(api.plot(mine))] == ["mine"]
 

@@ -26,7 +26,7 @@ def duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
 
 
-def shorten(text: str, longest: int) -> str:
+def shorten(text: str, longest: int = 60) -> str:
     """The beginning of a text that has more characters than `longest`."""
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 

@@ -28,7 +28,6 @@ from bcrl.results.layout import CONFIG
 RELEASED = {"boosting=on": "released", "transfer=shaping": "shaping_released"}
 #: The env that a command completes by an id, after which its results are named.
 OPEN = "gymnasium"
-_LONG = 60  # characters of a value that are shown
 
 Options = Mapping[str, str]  # by group
 
@@ -54,7 +53,7 @@ def tag_of(
         for tag, named in usual.items():
             changes.append(_changes(config, choices["env"], named, folders))
             if not changes[-1]:
-                return given or tag, {}
+                return given or tag, changes[0] if given else {}
     except BcrlError:  # the defaults of a user's own options may lack a value
         if given is None:
             raise
@@ -66,9 +65,9 @@ def tag_of(
 def settings_of(folder: Path, folders: Paths) -> Plain:
     """The settings that a results folder's tag stands for, by its config.yaml; empty if
     there is no tag or if the defaults are not known here."""
-    env, groups = folder.parent.name, catalog(folders)
     if "@" not in folder.name:
         return {}
+    env, groups = folder.parent.name, catalog(folders)
     try:
         config = yaml.safe_load((folder / CONFIG).read_bytes())
         options = _options(config, {}, False)
@@ -85,7 +84,7 @@ def meanings(settings: Mapping[Path, Plain]) -> list[str]:
     folders: dict[tuple[str, str], list[str]] = {}  # by tag and settings
     for folder, values in settings.items():
         present = {k: v for k, v in values.items() if v != ABSENT_KEY} or values
-        texts = (f"{k}={shorten(as_text(v), _LONG)}" for k, v in present.items())
+        texts = (f"{k}={shorten(as_text(v))}" for k, v in present.items())
         if text := ", ".join(texts):
             key = folder.name.partition("@")[2], text
             folders.setdefault(key, []).append(" ".join(folder.parts[-2:]))

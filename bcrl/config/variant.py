@@ -92,10 +92,8 @@ def method_name(
         return f"PPR-{whole}" if boosted else "PPR"
     if transfer is None or shaped:
         return whole
-    own = getattr(
-        transfer, "__name__", type(transfer).__name__
-    )  # a function's or class'
-    return f"{own.strip('<>')}-{whole}"
+    own = getattr(transfer, "__name__", type(transfer).__name__)
+    return f"{own.strip('<>')}-{whole}"  # a function may be a lambda
 
 
 def composition(config: Plain, tasks: list[Env]) -> Composition:

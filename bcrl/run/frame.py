@@ -24,7 +24,6 @@ from bcrl.q.regressors.ours import REGRESSORS
 from bcrl.results.layout import SETTING
 from bcrl.run.workers import do_jobs
 
-_LONG = 60  # characters of a setting that has no number or name
 SeedRows = list[dict[str, Any]]  # of one evaluation, one per seed
 #: Takes the place of a group, its iterations or steps so far, the task, and new rows.
 Report = Callable[[int, tuple[int, int, SeedRows]], None]
@@ -126,4 +125,4 @@ def _cell(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return names.get(type(value), type(value).__name__)
     text = getattr(value, "__name__", None) or " ".join(repr(value).split())
-    return shorten(text, _LONG)
+    return shorten(text)

@@ -48,15 +48,18 @@ def _methods(frame: pd.DataFrame, metric: str) -> Methods:
     found: dict[str, Variant] = {}
     for method, own in named.groupby("method", sort=False):
         varied = [x for x in settings if own[x].nunique(dropna=False) > 1]
-        groups = (
-            own.groupby(varied, sort=False, dropna=False) if varied else [((), own)]
-        )
-        for values, rows in groups:
-            pairs = zip(varied, values, strict=True)
-            told = [f"{k.removeprefix(SETTING)}={v}" for k, v in pairs if v == v]
-            label = " ".join([str(method), ", ".join(told)]).strip()
+        groups = own.groupby(varied, sort=False, dropna=False) if varied else ()
+        for values, rows in groups or [((), own)]:
+            given = ((k, v) for k, v in zip(varied, values, strict=True) if v == v)
+            told = (f"{k.removeprefix(SETTING)}={_text(v)}" for k, v in given)
+            label = f"{method} {', '.join(told)}".strip()
             found[label] = _variant_of(rows, metric, family, label)
     return found
+
+
+def _text(value: object) -> str:
+    """A setting's value; in a column with defaults, whole numbers are floats."""
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _variant_of(rows: pd.DataFrame, metric: str, family: str, label: str) -> Variant:
