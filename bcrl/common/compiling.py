@@ -17,6 +17,9 @@ class Compiled:
         functools.update_wrapper(self, function)
         self._function, self._options = function, options
 
+    def __reduce__(self) -> tuple:  # it is compiled anew in another process
+        return type(self), (self._function, self._options)
+
     @functools.cached_property
     def _dispatcher(self) -> Any:
         from bcrl.common import numba_cache  # a large import

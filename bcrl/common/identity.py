@@ -8,6 +8,7 @@ Plain = dict[str, Any]  # a resolved config: dicts, lists and scalars
 #: Top-level keys that change no number, but for another device's rounding.
 OUTPUT_KEYS = ("seeds", "workers", "threads", "device", "runs_dir", "tag", "progress")
 OUTPUT_KEYS += ("strict", "checkpoint_every", "logger", "keep", "extend")
+ABSENT_KEY = "absent"  # stands for the value of a key that one of two configs lacks
 
 
 def identity(config: Plain) -> Plain:
@@ -22,7 +23,7 @@ def identity(config: Plain) -> Plain:
 def differences(config: Plain, other: Plain) -> dict[str, tuple[Any, Any]]:
     """Dotted keys at which two configs' identities differ, with both values."""
     a, b = flat(identity(config)), flat(identity(other))
-    both = {k: (a.get(k, "absent"), b.get(k, "absent")) for k in sorted(a | b)}
+    both = {k: (a.get(k, ABSENT_KEY), b.get(k, ABSENT_KEY)) for k in sorted(a | b)}
     return {k: (x, y) for k, (x, y) in both.items() if x != y}
 
 

@@ -1,6 +1,5 @@
 """The jobs of a command line: each composed, checked and planned before any work."""
 
-import json
 import shlex
 from argparse import Namespace
 from collections.abc import Sequence
@@ -11,23 +10,15 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from bcrl.common import plugins
-from bcrl.common.files import sha256
-from bcrl.common.identity import OUTPUT_KEYS, Plain, differences, flat, identity
+from bcrl.common.identity import differences, flat
 from bcrl.config import hydra_compose, safety, schema
 from bcrl.config import plan as planning
 from bcrl.config.hints import Hints
-from bcrl.config.hydra_compose import CONF, CONFIG_NAME, Paths, composed, read_option
+from bcrl.config.hydra_compose import CONFIG_NAME, Paths, composed, read_option
 from bcrl.config.overrides import canonical, parse, product
 from bcrl.config.plan import Plan
-from bcrl.config.schema import VARIANT_GROUPS
+from bcrl.config.tags import OPEN, plain_config, tag_of
 from bcrl.errors import BcrlError, ConfigError, closest
-from bcrl.results.layout import recorded_seeds
-from bcrl.results.read import read_document
-
-#: The options that follow the authors' code, all of them with the tag `released`.
-RELEASED = {"boosting=on": "released", "transfer=shaping": "shaping_released"}
-#: The env that a command completes by an id, after which its results are named.
-OPEN = "gymnasium"
 
 
 def plans(arguments: Namespace) -> list[Plan]:
@@ -120,7 +111,7 @@ def _plan(job: DictConfig, folders: Paths, typed: Sequence[str] | None) -> Plan:
             line = f"env={choices['env']} variant={name}"
             why = f"means {group}={option}, not {group}={other}; did you mean {line}?"
             raise ConfigError("variant", name, why)
-    config = _plain(job)
+    config = plain_config(job)
     for key, name in plugins.named_code(config):
         said = (o.lstrip("+").partition("=") for o in typed or ())
         says = (name in value and f"{key}.".startswith(f"{k}.") for k, _, value in said)
@@ -129,10 +120,11 @@ def _plan(job: DictConfig, folders: Paths, typed: Sequence[str] | None) -> Plan:
     env = choices["env"]
     if env == OPEN:
         env = str(config["env"]["id"]).rpartition(":")[2].replace("/", "-")
-    tag, command = _tag(config, hydra, folders), _command(hydra, folders, launched)
-    more = {"command": command, "launcher": launcher if launched else None}
+    tag, settings = tag_of(config, hydra, folders)
+    command = _command(hydra, folders, launched)
+    more = {"settings": settings, "launcher": launcher if launched else None}
     try:
-        return planning.plan(config, env, tag, **more)
+        return planning.plan(config, env, tag, command=command, **more)
     except ConfigError as error:
         name = str(flat(config).get(f"{error.key}.name"))  # as it was typed
         option = name if "." in name else choices.get(error.key.replace(".", "/"))
@@ -154,73 +146,3 @@ def _command(hydra: DictConfig, folders: Paths, launched: bool) -> str:
     if hydra.runtime.choices.get("experiment") and not launched:
         words.append("hydra.mode=RUN")  # this job of its sweep, not all
     return shlex.join(words)
-
-
-def _tag(config: Plain, hydra: DictConfig, folders: Paths) -> str | None:
-    """The tag: the given one, none for the paper's options, `released`, or a digest."""
-    if config["tag"] is not None:
-        return config["tag"]
-    choices = hydra.runtime.choices
-    usual: dict[str | None, dict[str, str]] = {None: {}, "released": {}}
-    for group in VARIANT_GROUPS[1:]:
-        name = config[group].get("name")
-        if group in ("curriculum", "boosting"):
-            name = "off" if name == "off" else "on"
-        released = RELEASED.get(f"{group}={name}", name)
-        for tag, option in ((None, name), ("released", released)):
-            shipped = (CONF / group / f"{option}.yaml").exists()
-            usual[tag][group] = option if shipped else choices[group]
-    if not folders and _only_chooses(hydra):
-        for tag, named in usual.items():
-            if named.items() <= dict(choices).items():
-                return tag
-    words = [f"env={choices['env']}", "local=none"]
-    if choices["env"] == OPEN:
-        words.append(f"env.id='{config['env']['id']}'")
-    changes = []
-    for tag, named in usual.items():
-        chosen = (f"{group}={option}" for group, option in named.items())
-        changed = differences(config, _plain(composed((*words, *chosen), folders)))
-        if not changed:
-            return tag
-        changes.append({key: value for key, (value, _) in changed.items()})
-    text = json.dumps(changes[0], sort_keys=True)
-    return sha256(text.encode())[:8]
-
-
-def _only_chooses(hydra: DictConfig) -> bool:
-    """Whether a job overrides no number: no need to compose, which takes 0.1 s."""
-    experiment = read_option("experiment", hydra.runtime.choices.get("experiment"))
-    entries = experiment.get("defaults") or ()
-    keys = [o.lstrip("+").partition("=")[0] for o in hydra.overrides.task]
-    keys += [str(key).removeprefix("override /") for entry in entries for key in entry]
-    same = {"env.id", "variant", "experiment", "defaults", "hydra", *VARIANT_GROUPS}
-    keys += experiment
-    return all(key in same or key.partition(".")[0] in OUTPUT_KEYS for key in keys)
-
-
-def _plain(job: DictConfig) -> Plain:
-    """Our part of a composed config, resolved; BcrlError for what it can't hold."""
-    ours = OmegaConf.masked_copy(job, [str(key) for key in job if key != "hydra"])
-    config = hydra_compose.plain(ours)
-    for key in VARIANT_GROUPS:
-        if not isinstance(config[key], dict):  # a file's `boosting: 'on'`
-            why = f"is a section; an option stands in defaults: [override /{key}: …]"
-            raise ConfigError(key, config[key], why)
-    if (folder := config["start"].get("from")) is not None:
-        config["start"]["run"] = _recorded(folder)
-    for key, value in flat(config).items():  # tag=${env.gamma}
-        if key in schema.TEXTS and not isinstance(value, str | None):
-            raise ConfigError(key, value, "must be text: add some to the ${…}")
-    return config
-
-
-def _recorded(folder: object) -> Plain:
-    """What the run in a folder says about itself; ConfigError if there is none."""
-    place = Path(str(folder)).absolute()
-    if not (seeds := recorded_seeds(place, "json")):
-        why = "holds no run; name one such as runs/quick/maze/BC-FQI"
-        raise ConfigError("start.from", folder, why)
-    document = read_document(place, seeds[0])
-    named = {"env": document["env"], "tag": document["tag"]}
-    return named | {"config": identity(document["config"])}

@@ -1,7 +1,7 @@
 """From a composed configuration to a plan: stages, transfers, variant, directory."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,11 @@ from bcrl.common.identity import OUTPUT_KEYS, Plain
 from bcrl.config.algorithms import algorithm
 from bcrl.config.rules import check_numbers
 from bcrl.config.schema import Choice, Config, Start, check_name, check_path
-from bcrl.config.variant import Composition, Past, composition
+from bcrl.config.variant import Past, composition, method_name
 from bcrl.envs import Env, check_tasks, tasks_of
 from bcrl.errors import ConfigError, did_you_mean
 from bcrl.evaluation.metrics import check_metrics
 from bcrl.learning.stage import Stage
-from bcrl.learning.transfer import PolicyReuse, ResidualPolicy, Shape
 from bcrl.results.loggers import logger
 
 KEEP = ("none", "final", "stages", "state")  # of what a complete seed has learned
@@ -41,6 +40,7 @@ class Plan:
     config: Plain  # resolved, whole
     sources: str = ""  # a digest of the user's code that it runs
     command: str = ""  # what runs this plan alone, a line each if there are several
+    settings: Plain = field(default_factory=dict)  # that the tag stands for
     launcher: Plain | None = None  # of Slurm's parameters, if its jobs run this
     source: "Plan | None" = None  # the run whose agents the first stage starts from
 
@@ -91,12 +91,13 @@ def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
     mapped = bool(config["start"].get("observation"))
     chosen = composition(config, tasks, _past(source, mapped) if source else None)
     stages = module.stages(config["algorithm"], chosen)
+    alone = chosen.target_only and source is None
     asked = _asked(config["seeds"])
     device = usable_device(config["device"], module.FAMILY)
     own_lockstep = LOCKSTEP_ON_GPU if device == "cuda" else module.LOCKSTEP
     return Plan(
         env=env,
-        variant=_variant(config["algorithm"]["name"], chosen),
+        variant=method_name(config["algorithm"]["name"], chosen.transfers, alone),
         tag=tag,
         family=module.FAMILY,
         stages=stages,
@@ -164,20 +165,6 @@ def part(seeds: tuple[int, ...], which: str | None) -> tuple[int, ...]:
         why = f"must be K/N, the K-th of at most {len(seeds)} parts, such as 1/2"
         raise ConfigError("seeds.part", which, why)
     return seeds[(number - 1) * len(seeds) // parts : number * len(seeds) // parts]
-
-
-def _variant(algorithm_name: str, chosen: Composition) -> str:
-    """`SBC-DQN` and the like; policy reuse and residual policy by their own names."""
-    transfer = chosen.transfer
-    prefix = "S" * isinstance(transfer, Shape) + "B" * (chosen.boost is not None)
-    prefix += "C" * (not chosen.target_only or chosen.past is not None)
-    whole = f"{prefix}-{algorithm_name.rpartition('.')[2].upper()}".lstrip("-")
-    if isinstance(transfer, ResidualPolicy):
-        return "RPL"
-    if isinstance(transfer, PolicyReuse):
-        return f"PPR-{whole}" if chosen.boost else "PPR"
-    own = transfer is not None and not isinstance(transfer, Shape)
-    return f"{type(transfer).__name__}-{whole}" if own else whole
 
 
 def usable_device(wanted: str, family: str) -> str:

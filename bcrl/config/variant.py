@@ -87,6 +87,26 @@ class Composition:
                 raise ConfigError(key, one, "has no effect: stages start as without it")
 
 
+def method_name(
+    algorithm: str, transfers: Sequence[handed.Transfer], target_only: bool
+) -> str:
+    """`SBC-DQN` and the like; policy reuse and residual policy by their own names."""
+    others = [t for t in transfers if not isinstance(t, handed.Boost)]
+    boosted = len(others) < len(transfers)
+    transfer = next((t for t in others if t is not handed.warm_start), None)
+    shaped = isinstance(transfer, handed.Shape)
+    prefix = "S" * shaped + "B" * boosted + "C" * (not target_only)
+    whole = f"{prefix}-{algorithm.rpartition('.')[2].upper()}".lstrip("-")
+    if isinstance(transfer, handed.ResidualPolicy):
+        return "RPL"
+    if isinstance(transfer, handed.PolicyReuse):
+        return f"PPR-{whole}" if boosted else "PPR"
+    if transfer is None or shaped:
+        return whole
+    own = getattr(transfer, "__name__", type(transfer).__name__)
+    return f"{own.strip('<>')}-{whole}"  # a function may be a lambda
+
+
 def composition(config: Plain, tasks: list[Env], past: Past | None) -> Composition:
     """The groups' choices; ConfigError if they make no sense together."""
     boost = _component("boosting", config["boosting"], {"on": handed.Boost})

@@ -9,10 +9,12 @@ import numpy as np
 import yaml
 from scipy import stats
 
-from bcrl.report import statistics, tables
-from bcrl.report.statistics import FEWEST_SEEDS, Interval
-from bcrl.report.tables import ABSENT, PARAGRAPHS, Section, TextTable, number
+from bcrl.common.text import ABSENT, duration, estimate, number
+from bcrl.report import tables
+from bcrl.report.tables import PARAGRAPHS, Section, TextTable
 from bcrl.report.variants import Methods, Runs, Variant, incomplete, listed, tags_shown
+from bcrl.results import statistics
+from bcrl.results.statistics import FEWEST_SEEDS, Interval
 
 _OPTIMAL = 1e-3  # a return this near V*(s0) is optimal: a detour costs 100 times more
 _NEAR = 0.01  # a mean return within this share of |V*(s0)| is nearly optimal
@@ -112,7 +114,7 @@ def claims_sections(runs: Runs, tag: str | None) -> dict[tuple[str, str], Sectio
         parts = [f"{len(rows)} claims: {counted}.\n", TextTable(rows)]
         if len({variant.tag for variant in variants}) > 1:
             parts.insert(0, f"{tags_shown(methods)}; the others are untagged.\n")
-        seconds = tables.duration(sum(variant.cpu_seconds for variant in variants))
+        seconds = duration(sum(variant.cpu_seconds for variant in variants))
         parts += [*_values(variants, family), f"CPU time of these runs: {seconds}.\n"]
         found[env, family] = Section(_TITLES[env], parts)
     return found
@@ -128,7 +130,7 @@ def _judged(statement: str, claim: list[str], runs: Methods) -> dict[str, str]:
     try:
         if not absent:
             value, interval, detail = _measured(quantity, used)
-            shown = tables.estimate(value, interval) + detail
+            shown = estimate(value, interval) + detail
             decided = verdict(value, interval, expect, min(counts))
     except NotMeasurable as reason:
         decided = f"not measurable: {reason}"
@@ -185,7 +187,7 @@ def _values(variants: Iterable[Variant], family: str) -> list[str | TextTable]:
         seeds = tables.seeds_cell(n, len(variant.failed))
         row = {"method": variant.name, "seeds": seeds}
         for name, values in measured.items():
-            row[name] = tables.estimate(values.mean(), statistics.bootstrap(values))
+            row[name] = estimate(values.mean(), statistics.bootstrap(values))
         for name in ("q_error", "q_error_start", "return", "late return"):
             if name in measured:
                 row[f"{name}, IQM"] = number(stats.trim_mean(measured[name], 0.25))

@@ -2,6 +2,7 @@
 
 import inspect
 import sys
+from argparse import Namespace
 from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
@@ -14,8 +15,10 @@ from bcrl.common.terminal import ready, say, show
 from bcrl.errors import BcrlError
 from bcrl.report import tables
 from bcrl.report.animation import animations, gif_of
+from bcrl.report.choose import draw_chosen
 from bcrl.report.claims import claims_report, claims_sections
 from bcrl.report.figures import curves, linear, maze, style
+from bcrl.report.figures.layout import Print, formats, inches, save_figure
 from bcrl.report.load import load_runs
 from bcrl.report.page import page
 from bcrl.report.variants import COMPARED, LINEAR, Pair, Runs, env_title
@@ -31,6 +34,9 @@ FIGURES: dict[str, tuple[Pair, str, str | None, Callable[..., Figure]]] = {
     "4b": (LQ, "fig4", None, linear.figure_4b),
     "5": (MAZE, "fig2", "BC-FQI", curves.figure_5),
 }
+#: Options that need --compare or --sweep; those that exclude them, and their defaults.
+_CHOOSING = ("env", "metrics", "target_only", "name")
+_NOT_CHOOSING = {"figures": ["all"], "tag": None, "gif": None}
 CURVES = "curves"  # learning curves of what the paper has no figure of
 
 
@@ -50,20 +56,37 @@ def _parser() -> ResultsParser:
     text = "draw what is complete of unfinished runs, and say so in every figure"
     add("--allow-incomplete", action="store_true", help=text)
     add("--out", type=Path, help="default: figures in the runs' folder")
+    text = "column (3.25 in), text (6.75 in) or inches; default: %(default)s"
+    add("--width", default="text", help=text)
+    text = "kinds of the figures' files, of png, pdf, svg; default: %(default)s"
+    add("--format", default="png,pdf", metavar="LIST", help=text)
+    text = "write the caption to a text file instead of below the figure"
+    add("--caption-file", action="store_true", help=text)
+    chosen = result.add_argument_group("instead of the report, one figure per metric")
+    add = chosen.add_argument
+    text = "curves of these variants, such as BC-FQI@mine, 'BC-FQI*' or a folder's path"
+    add("--compare", nargs="+", metavar="VARIANT", help=text)
+    text = "variants (all, or those of --compare) by the value of a key or of two"
+    add("--sweep", nargs="+", metavar="KEY", help=text)
+    add("--env", help="their environment, if several have such runs")
+    add("--metrics", nargs="+", metavar="METRIC", help="default: all that they have")
+    add("--target-only", action="store_true", help="leave the easier tasks out")
+    add("--name", help="what the files' names begin with")
     return result
 
 
 def report(
-    runs: Runs, out: Path, figures: Collection[str], tag: str | None
+    runs: Runs, out: Path, figures: Collection[str], tag: str | None, how: Print
 ) -> tuple[list[Path], list[str]]:
     """Write these figures and all documents: the files, what was skipped and why."""
+    how = how._replace(kinds=list(dict.fromkeys(["png", *how.kinds])))  # for the page
     suffix = f"{runs.scale}@{tag}" if tag else runs.scale
     files: list[Path] = []
     skipped, drawn = [], defaultdict(list)
 
     def save(figure: Figure, name: str, title: str, pair: Pair, caption: str) -> None:
         """Save a figure, and keep its PNG and caption for the page."""
-        saved = style.save_figure(figure, out, name, title)
+        saved = save_figure(figure, out, name, title, how)
         files.extend(saved)
         drawn[pair].append((saved[0], caption))
 
@@ -74,7 +97,13 @@ def report(
         if methods and (not needed or needed in methods):
             title = f"Klink et al. (2022), figure {name}, reproduced: {suffix}"
             caption = f"Figure {name}. {inspect.getdoc(draw).splitlines()[0]}"
-            save(draw(runs, tag), f"figure_{name}_{suffix}", title, pair, caption)
+            save(
+                draw(runs, tag, how.width),
+                f"figure_{name}_{suffix}",
+                title,
+                pair,
+                caption,
+            )
             continue
         lacking = f"{pair[0]}/{needed or '*'}{f'@{tag}' if tag else ''}"
         which = {None: "", "released": "_released"}.get(tag, f" tag={tag}")
@@ -88,7 +117,7 @@ def report(
             place = f"{runs.scale}@{each}" if each else runs.scale
             title = f"{', '.join(pair)}: learning curves, {place}"
             caption = "Mean over seeds with 95 % intervals."
-            figure = curves.figure_curves(runs, *pair, each)
+            figure = curves.figure_curves(runs, *pair, each, how.width)
             save(figure, "_".join(["curves", *pair, place]), title, pair, caption)
 
     def write(name: str, text: str | pd.DataFrame) -> None:
@@ -118,11 +147,33 @@ def report(
     return files, skipped
 
 
+def _draw_chosen(options: Namespace, how: Print) -> int:
+    """Draw what --compare and --sweep ask for."""
+    for name, usual in _NOT_CHOOSING.items():
+        if getattr(options, name) != usual:
+            text = "cannot be combined with --compare or --sweep"
+            raise BcrlError(f"--{name}: {text}; name a tagged variant BC-FQI@TAG")
+    out = options.out or options.runs_dir / "figures"
+    make_directory(out, "--out")
+    with style.sheet():
+        files = draw_chosen(options, out, how)
+    show("\n".join(map(str, files)))
+    return 0
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; 0 if all went well, 2 with one message for what a user can mend."""
     ready()
     try:
         options = _parser().parsed(arguments)
+        how = Print(
+            inches(options.width), formats(options.format), options.caption_file
+        )
+        if options.compare or options.sweep:
+            return _draw_chosen(options, how)
+        if alone := [name for name in _CHOOSING if getattr(options, name)]:
+            flag = f"--{alone[0].replace('_', '-')}"
+            raise BcrlError(f"{flag}: needs --compare or --sweep")
         chosen = [*FIGURES, CURVES] if "all" in options.figures else options.figures
         runs = load_runs(options.runs_dir, options.scale, options.allow_incomplete)
         for note in runs.notes:
@@ -133,7 +184,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.gif is not None:  # first: the page shows them
             shown, not_shown = animations(runs, out, options.tag, options.gif)
         with style.sheet():
-            files, skipped = report(runs, out, chosen, options.tag)
+            files, skipped = report(runs, out, chosen, options.tag, how)
     except BcrlError as error:
         say(f"bcrl-report: {error}")
         return 2

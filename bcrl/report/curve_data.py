@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.colors import to_hex, to_rgb
 
 from bcrl.report.figures import curves, style
-from bcrl.report.statistics import bootstrap_curves
 from bcrl.report.variants import Runs, Variant
 from bcrl.results.layout import INDEX
+from bcrl.results.statistics import bootstrap_curves
 
 _SEEDS = 20  # whose own lines can be shown, the first of a variant's
 _FIRST_SHOWN = 8  # variants that are shown at first if none has the tag

@@ -2,15 +2,16 @@
 
 import json
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from bcrl.errors import BcrlError
 from bcrl.report.variants import COMPARED, Note, Runs, Variant, across_methods, listed
-from bcrl.results.integrity import Checked, check_tree
+from bcrl.results.integrity import Checked, check_folder, check_tree
 from bcrl.results.layout import FAILED, FQI_METRICS, INDEX, family_of, state_of
-from bcrl.results.read import BROKEN, INCOMPLETE
+from bcrl.results.read import BROKEN, INCOMPLETE, Finding
 
 LISTED = 10  # findings that an error names
 
@@ -19,16 +20,7 @@ def load_runs(runs_dir: Path, scale: str, allow_incomplete: bool = False) -> Run
     """Everything complete under `runs_dir`/`scale`. BcrlError if there is nothing, if a
     file is broken or, unless `allow_incomplete`, if a requested seed is incomplete."""
     checked, findings = check_tree(runs_dir, scale)
-    rejected = [f for f in findings if f.kind == BROKEN or not allow_incomplete]
-    if rejected:
-        lines = [f"nothing is drawn, because in {runs_dir / scale}:"]
-        lines += [f"  {finding}" for finding in rejected[:LISTED]]
-        if (more := len(rejected) - LISTED) > 0:
-            command = shlex.join(["bcrl-verify", str(runs_dir)])
-            lines.append(f"  and {more} more; `{command}` lists all")
-        if any(finding.kind == INCOMPLETE for finding in rejected):
-            lines.append("--allow-incomplete draws what is complete, and says so")
-        raise BcrlError("\n".join(lines))
+    _reject(findings, runs_dir, f" in {runs_dir / scale}", allow_incomplete)
     notes: list[Note] = []
     loaded = [_variant(each, notes) for each in checked]
     runs = Runs(scale, tuple(filter(None, loaded)), notes)
@@ -49,6 +41,36 @@ def load_runs(runs_dir: Path, scale: str, allow_incomplete: bool = False) -> Run
             awaited = methods if tag else expected or methods
             notes.extend(across_methods(methods, awaited, env, tag, family))
     return runs
+
+
+def load_chosen(folders: Sequence[Path], allow_incomplete: bool = False) -> Runs:
+    """The variants of some folders of any scales and environments, in this order."""
+    checked = [check_folder(folder.resolve()) for folder in folders]
+    findings = [finding for each in checked for finding in each.findings]
+    _reject(findings, folders[0].resolve().parents[2], "", allow_incomplete)
+    notes: list[Note] = []
+    variants = tuple(filter(None, [_variant(each, notes) for each in checked]))
+    if not variants:
+        raise BcrlError("; ".join(["no complete runs", *(note.text for note in notes)]))
+    scales = dict.fromkeys(folder.resolve().parts[-3] for folder in folders)
+    return Runs(listed(scales), variants, notes)
+
+
+def _reject(
+    findings: Sequence[Finding], runs_dir: Path, where: str, allow_incomplete: bool
+) -> None:
+    """Raise BcrlError for what forbids drawing, if anything does."""
+    rejected = [f for f in findings if f.kind == BROKEN or not allow_incomplete]
+    if not rejected:
+        return
+    lines = [f"nothing is drawn, because{where}:"]
+    lines += [f"  {finding}" for finding in rejected[:LISTED]]
+    if (more := len(rejected) - LISTED) > 0:
+        command = shlex.join(["bcrl-verify", str(runs_dir)])
+        lines.append(f"  and {more} more; `{command}` lists all")
+    if any(finding.kind == INCOMPLETE for finding in rejected):
+        lines.append("--allow-incomplete draws what is complete, and says so")
+    raise BcrlError("\n".join(lines))
 
 
 def _variant(checked: Checked, notes: list[Note]) -> Variant | None:

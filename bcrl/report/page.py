@@ -13,8 +13,9 @@ from markupsafe import Markup, escape
 
 from bcrl import __version__
 from bcrl.common.identity import as_text, differences, flat, identity
+from bcrl.common.text import ABSENT, duration, number
 from bcrl.report.curve_data import curve_data
-from bcrl.report.tables import ABSENT, PARAGRAPHS, Section, TextTable, duration, number
+from bcrl.report.tables import PARAGRAPHS, Section, TextTable
 from bcrl.report.variants import Pair, Runs, env_title, incomplete
 from bcrl.results.layout import seed_path, spelled
 

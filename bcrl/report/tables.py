@@ -10,11 +10,12 @@ import pandas as pd
 import yaml
 
 from bcrl.common.identity import as_text, flat, identity
-from bcrl.report.statistics import FEWEST_SEEDS, Interval, bootstrap, standard_error
-from bcrl.report.variants import WINDOW, Note, Runs, Variant
+from bcrl.common.text import ABSENT, estimate
+from bcrl.report.variants import Note, Runs, Variant
 from bcrl.results.layout import INDEX, spelled
+from bcrl.results.outcomes import WINDOW
+from bcrl.results.statistics import FEWEST_SEEDS, bootstrap, standard_error
 
-ABSENT = "–"  # a cell without a value
 _PATH = Path(__file__).with_name("templates") / "texts.yaml"
 _TEXT = _PATH.read_text("utf-8").format(fewest=FEWEST_SEEDS, window=WINDOW)
 PARAGRAPHS = yaml.safe_load(_TEXT)  # paragraphs of the documents and the page, by name
@@ -48,25 +49,6 @@ def notes_section(notes: Iterable[Note]) -> list[Section]:
     return [Section("Notes on the runs", [listed])] if listed else []
 
 
-def number(value: float) -> str:
-    """Four significant digits, a real minus sign, a dash for nan."""
-    if not np.isfinite(value):
-        return ABSENT
-    return f"{value:#.4g}".rstrip(".").replace("-", "−")
-
-
-def estimate(value: float, interval: Interval) -> str:
-    """`0.12 [0.10, 0.14]`, without the brackets if there is no interval."""
-    if not np.isfinite(interval).all():
-        return number(value)
-    return f"{number(value)} [{number(interval[0])}, {number(interval[1])}]"
-
-
-def duration(seconds: float) -> str:
-    """`1.5 h`, `12 s`."""
-    return f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
-
-
 def seeds_cell(complete: int, failed: int) -> str:
     """`100`, or `97 (3 failed)` if some diverged."""
     return f"{complete} ({failed} failed)" if failed else f"{complete}"
@@ -83,7 +65,7 @@ def aggregate(runs: Runs, family: str = "FQI") -> pd.DataFrame:
         for metric, values in variant.metrics.items():
             block = index | {"metric": metric, "seeds": len(variant.seeds)}
             block["mean"] = values.mean(axis=0)
-            block["standard_error"] = standard_error(values, ddof=1)
+            block["standard_error"] = standard_error(values)
             blocks.append(pd.DataFrame(block))
     return pd.concat(blocks, ignore_index=True)
 

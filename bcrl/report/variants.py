@@ -9,10 +9,10 @@ import numpy as np
 
 from bcrl.common.divergence import diverging
 from bcrl.results.layout import seed_path, spelled
+from bcrl.results.outcomes import late_rows
 from bcrl.results.read import read_arrays
 
 LINEAR = "linear_system"
-WINDOW = 5000  # environment steps before a run's end whose evaluations are averaged
 #: The methods of each family, in the order of the legends.
 METHODS = ("FQI", "C-FQI", "B-FQI", "BC-FQI")
 _DQN = "DQN C-DQN B-DQN BC-DQN S-DQN SC-DQN SB-DQN SBC-DQN RPL PPR"
@@ -89,11 +89,21 @@ class Variant:
         """A metric at the last evaluation, (S,)."""
         return self.metrics[metric][:, -1]
 
+    @property
+    def late_rows(self) -> np.ndarray:
+        """Rows of the target in a run's last WINDOW environment steps, (L,)."""
+        return late_rows(self.task, self.index)
+
     def late(self, metric: str) -> np.ndarray:
-        """Every seed's mean over the target's evaluations in the last WINDOW steps."""
-        rows = self.target_rows
-        rows = rows[self.index[rows] > self.index[-1] - WINDOW]
-        return self.metrics[metric][:, rows].mean(axis=1)
+        """Every seed's mean over the `late_rows`, (S,)."""
+        return self.metrics[metric][:, self.late_rows].mean(axis=1)
+
+    def final(self, metric: str) -> np.ndarray:
+        """What a run ends with, (S,): the last value or, in the DQN family, a mean over
+        the `late_rows` that have one; nan where there is none."""
+        rows = self.late_rows if self.family == "DQN" else [-1]
+        values = np.ma.masked_invalid(self.metrics[metric][:, rows])
+        return np.asarray(values.mean(axis=1).filled(np.nan))
 
     def area(self, metric: str) -> np.ndarray:
         """Every seed's mean over all evaluations in the target, (S,)."""
@@ -164,7 +174,9 @@ def listed(items: Iterable[object]) -> str:
 
 def tags_shown(methods: Methods) -> str:
     """`variants @released`, or whose: `@released: BC-DQN, SC-DQN`."""
-    tagged = {name: v.tag for name, v in methods.items() if v.tag}
+    tagged = {name: v.tag for name, v in methods.items() if v.tag and v.tag not in name}
+    if len(set(tagged.values())) > 1:
+        return ""
     (tag,) = set(tagged.values()) or {""}
     if len(tagged) in (0, len(methods)):
         return f"variants @{tag}" if tag else ""
@@ -176,9 +188,10 @@ def remarks(runs: Runs, methods: Methods, compares: bool = True) -> list[str]:
     `compares`: differences between methods belong to it too."""
     env, family = next((v.env, v.family) for v in methods.values())
     tags = {v.tag for v in methods.values()}
+    drawn = {(v.method, v.tag) for v in methods.values()}
 
     def belongs(note: Note) -> bool:
-        if note.method in methods and methods[note.method].tag == note.tag:
+        if (note.method, note.tag) in drawn:
             return True
         if note.method:  # it isn't drawn: perhaps it has no complete seed
             awaited = note.method in COMPARED.get((env, family), ())
@@ -186,7 +199,7 @@ def remarks(runs: Runs, methods: Methods, compares: bool = True) -> list[str]:
         return compares and note.family == family and {note.tag} == tags
 
     shown = [note for note in runs.notes if note.env == env and belongs(note)]
-    if compares and len(tags) > 1:  # no notes were made for such a mixture yet
+    if compares and not any(note.family for note in shown):  # as of a mixture of tags
         shown += across_methods(methods, methods, env, None, family)
     odd = "; ".join(n.footer for n in shown if n.footer and not n.incomplete)
     return list(filter(None, [incomplete(shown), odd and f"Note: {odd}"]))
@@ -203,7 +216,7 @@ def across_methods(
 ) -> list[Note]:
     """Notes on compared methods that are absent or that differ in seeds or length. In
     the DQN family lengths differ by design and aren't compared."""
-    variants, suffix = methods.values(), f"@{tag}" if tag else ""
+    suffix = f"@{tag}" if tag else ""
     absent = [f"{name}{suffix}" for name in expected if name not in methods]
     found = [f"no runs of {listed(absent)}"] if absent else []
     compared = {"seeds": lambda v: spelled(v.seeds), "optima": lambda v: v.optimum}
@@ -211,8 +224,9 @@ def across_methods(
         compared["iterations"] = lambda v: len(v.stage)
     for what, value_of in compared.items():
         groups: dict[object, list[str]] = {}
-        for variant in variants:
-            groups.setdefault(value_of(variant), []).append(variant.name)
+        for label, variant in methods.items():
+            name = label if label.startswith(variant.name) else variant.name
+            groups.setdefault(value_of(variant), []).append(name)
         if len(groups.keys() - {None}) > 1:
             texts = [f"{value}: {listed(names)}" for value, names in groups.items()]
             found.append(f"{what} differ: {'; '.join(texts)}")

@@ -38,6 +38,7 @@ DQN_METRICS = (
     *("greedy_return", "greedy_discounted_return", "greedy_success_rate"),
 )
 MAY_BE_NAN = ("q_mean", "loss")  # those with nothing to average at times
+SETTING = "learner."  # in a frame of `bcrl.api.run`: columns of a learner's settings
 
 
 def seed_name(seed: int) -> str:

@@ -2,6 +2,7 @@
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -9,6 +10,10 @@ import pandas as pd
 from bcrl.errors import BcrlError
 from bcrl.results import layout
 from bcrl.results.read import Document, Finding
+
+#: Before pandas 3.1, numbers that are read are rounded unless it is told not to.
+_OLD = [*map(int, pd.__version__.split(".")[:2])] < [3, 1]
+_EXACT: dict[str, Any] = {"float_precision": "round_trip"} if _OLD else {}
 
 
 def parsed(path: Path, data: bytes, document: Document) -> pd.DataFrame:
@@ -53,10 +58,18 @@ def _disorder(table: pd.DataFrame) -> str:
     return ""
 
 
-def read_folder(folder: str | Path) -> pd.DataFrame:
-    """All CSVs in a variant's folder, unchecked, with a column `seed`, or BcrlError."""
-    numbers = layout.recorded_seeds(Path(folder), "csv")
+def read_results(path: str | Path) -> pd.DataFrame:
+    """A frame that `bcrl.api.run` saved, or all CSVs in a variant's folder, unchecked,
+    with columns `method`, the folder's name, and `seed`. BcrlError if there is none."""
+    path = Path(path)
+    if path.is_file():
+        return pd.read_csv(path, keep_default_na=False, na_values=[""], **_EXACT)
+    numbers = layout.recorded_seeds(path, "csv")
     if not numbers:
-        raise BcrlError(f"{folder}: there is no seed_*.csv")
-    found = {n: pd.read_csv(layout.seed_path(Path(folder), n, "csv")) for n in numbers}
-    return pd.concat(found, names=["seed"]).reset_index("seed").reset_index(drop=True)
+        raise BcrlError(f"{path}: is no saved frame, and there is no seed_*.csv")
+    found = {
+        n: pd.read_csv(layout.seed_path(path, n, "csv"), **_EXACT) for n in numbers
+    }
+    table = pd.concat(found, names=["seed"]).reset_index("seed").reset_index(drop=True)
+    table.insert(0, "method", path.resolve().name)
+    return table

@@ -71,6 +71,7 @@ def launch(plans: Sequence[Plan]) -> None:
         divided = [replace(plan, seeds=seeds) for seeds in parts]
         jobs += [each for each in divided if records.pending(each)]
     executor, arrays, stop = _executor(params), list[str](), Stop()
+    began = time.monotonic()
     with stop.on_signals():
         for first in range(0, len(jobs), _ARRAY):
             some = jobs[first : first + _ARRAY]
@@ -86,7 +87,7 @@ def launch(plans: Sequence[Plan]) -> None:
                 break
         if arrays or stop.requested:
             _wait(arrays, plans[0].config["progress"] != "none", stop)
-    runner.check_complete(plans)
+    runner.check_complete(plans, time.monotonic() - began)
 
 
 def _executor(params: dict[str, Any]) -> submitit.AutoExecutor:

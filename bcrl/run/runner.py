@@ -12,19 +12,11 @@ from bcrl.errors import BcrlError
 from bcrl.evaluation import oracle
 from bcrl.evaluation.metrics import needs_reference
 from bcrl.results.layout import COMPLETE, seed_name
-from bcrl.run import (
-    agent_files,
-    checkpoints,
-    extension,
-    job,
-    locks,
-    memory,
-    records,
-    status,
-)
+from bcrl.run import agent_files, checkpoints, extension, job, locks, memory, records
 from bcrl.run.origin import run_origin
 from bcrl.run.progress import Progress
 from bcrl.run.schedule import Failures, Job, merged, ordered
+from bcrl.run.summary import summary
 from bcrl.run.workers import cores, do_jobs
 
 
@@ -42,7 +34,7 @@ def run(*plans: Plan) -> None:
     seeds failed, Interrupted after a signal, both with everything else kept.
     """
     compiling.check()
-    quiet = plans[0].config["progress"] == "none"
+    began, quiet = time.monotonic(), plans[0].config["progress"] == "none"
     plans, stop, failed = tuple(merged(plans)), Stop(), Failures()
     with stop.on_signals():
         for plan in plans:
@@ -56,24 +48,24 @@ def run(*plans: Plan) -> None:
                 _wait(jobs, quiet, stop)
     if jobs:
         raise Interrupted
-    for plan in () if quiet else plans:
-        for line in status.diverging_lines(plan):
-            say(line)
-    _check(plans, failed)
+    _end(plans, failed, time.monotonic() - began)
 
 
-def check_complete(plans: Sequence[Plan]) -> None:
-    """Raise SeedsFailed, as `run`, for seeds that other processes left incomplete."""
+def check_complete(plans: Sequence[Plan], seconds: float) -> None:
+    """End as `run` after other processes did the work in so many seconds."""
     plans, failed = merged(plans), Failures()
     for plan in plans:
         found = {seed: records.state(plan.directory, seed) for seed in plan.seeds}
         lost = {s: why or x for s, (x, why) in found.items() if x != COMPLETE}
         failed[plan.directory] = lost
-    _check(plans, failed)
+    _end(plans, failed, seconds)
 
 
-def _check(plans: Sequence[Plan], failed: Failures) -> None:
-    """Raise SeedsFailed if seeds failed, with the commands that run them again."""
+def _end(plans: Sequence[Plan], failed: Failures, seconds: float) -> None:
+    """Show what the runs achieved; raise SeedsFailed if seeds failed, with the commands
+    that run them again."""
+    if plans[0].config["progress"] != "none":
+        say(summary(plans, seconds))
     number, lines, commands = sum(map(len, failed.values())), list[str](), list[str]()
     for plan in plans:
         reasons = dict(sorted(failed.get(plan.directory, {}).items()))

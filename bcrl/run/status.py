@@ -3,9 +3,10 @@
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from bcrl.config import jobs
+from bcrl.common.identity import Plain
+from bcrl.common.text import aligned
+from bcrl.config import jobs, tags
 from bcrl.config.plan import Plan
 from bcrl.errors import BcrlError
 from bcrl.results import layout
@@ -32,25 +33,30 @@ def dry_run(plans: Sequence[Plan]) -> str:
     at_once = sum(sorted(size for _, size in sizes)[-workers:]) / memory.GIB
     room = f"about {at_once:.1f} of {memory.available() / memory.GIB:.1f} GiB"
     last = f"{total}, {wall}, {room}; nothing was run or written"
-    table = _table(rows, "complete", "to do", "jobs", "core min", "GiB per job")
-    return "\n".join([table, *hopeless, last])
+    table = aligned(rows, "complete", "to do", "jobs", "core min", "GiB per job")
+    settings = tags.meanings({plan.directory: plan.settings for plan in plans})
+    return "\n".join([table, *settings, *hopeless, last])
 
 
 def status(arguments: Namespace) -> str:
     """The states of a command line's seeds, or of all in its `runs_dir`, as a table."""
-    asked: list[tuple[Path, Sequence[int]]] = []
+    asked, settings = list[tuple[Path, Sequence[int]]](), dict[Path, Plain]()
     if all(override.startswith("runs_dir=") for override in arguments.overrides):
         any_ = [*arguments.overrides, "env=maze"]  # it is a required choice
-        (plan,) = jobs.plans(Namespace(**vars(arguments) | {"overrides": any_}))
+        words = Namespace(**vars(arguments) | {"overrides": any_})
+        (plan,) = jobs.plans(words)
         for path in sorted(plan.root.glob(f"*/*/*/{layout.CONFIG}")):
             begun = layout.recorded_seeds(path.parent, "json")
             documents = [records.read_facts(path.parent, seed) for seed in begun]
             ever = set(begun).union(*(layout.requested(d) for d in documents if d))
             asked.append((path.parent, sorted(ever)))
+            settings[path.parent] = tags.settings_of(path.parent, words.folders)
         if not asked:
             raise BcrlError(f"runs_dir={plan.root}: holds no runs")
     else:
-        asked += [(p.directory, p.seeds) for p in merged(jobs.plans(arguments))]
+        plans = merged(jobs.plans(arguments))
+        asked = [(plan.directory, plan.seeds) for plan in plans]
+        settings = {plan.directory: plan.settings for plan in plans}
     rows, lines = dict[str, list[int]](), list[str]()
     for directory, seeds in asked:
         name = " ".join(directory.parts[-3:])
@@ -60,23 +66,5 @@ def status(arguments: Namespace) -> str:
         states = [state for state, _ in found.values()]
         rows[name] = [len(seeds), *map(states.count, records.STATES)]
     rows["in all"] = [sum(column) for column in zip(*rows.values(), strict=True)]
-    return "\n".join([_table(rows, "seeds", *records.STATES), *lines])
-
-
-def diverging_lines(plan: Plan) -> list[str]:
-    """After a run: which metrics of which seeds diverge."""
-    facts = {seed: records.read_facts(plan.directory, seed) for seed in plan.seeds}
-    far = {s: ", ".join(each.get("diverging", ())) for s, each in facts.items()}
-    lines = {s: f"{metrics} diverges" for s, metrics in far.items() if metrics}
-    return records.by_reason(f"{plan.env} {plan.name}", lines)
-
-
-def _table(rows: dict[str, list[Any]], *columns: str) -> str:
-    """Rows by name as aligned lines."""
-    texts = [
-        [name, *(f"{x:.1f}" if isinstance(x, float) else f"{x}" for x in row)]
-        for name, row in {"": columns, **rows}.items()
-    ]
-    first, *others = (max(map(len, column)) for column in zip(*texts, strict=True))
-    form = "  ".join([f"{{:<{first}}}", *(f"{{:>{width}}}" for width in others)])
-    return "\n".join(form.format(*line) for line in texts)
+    table = aligned(rows, "seeds", *records.STATES)
+    return "\n".join([table, *tags.meanings(settings), *lines])

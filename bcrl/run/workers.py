@@ -3,11 +3,13 @@
 import multiprocessing
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from multiprocessing import connection, resource_tracker
+from types import ModuleType
 from typing import Any
 
 from bcrl.common.signals import SIGNALS, Stop
@@ -77,9 +79,11 @@ def _started(do: Do) -> tuple[Any, Any]:
     resource_tracker.ensure_running()  # it would unblock what is blocked below
     # A worker inherits the mask: no signal comes before it can ignore it.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-    try:
+    main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+    try:  # a worker imports no script: it would run as a whole once more
         process.start()
     finally:
+        sys.modules["__main__"] = main
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     theirs.close()  # so that the process's end shows in ours
     return ours, process

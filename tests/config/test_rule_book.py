@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from bcrl import api
-from bcrl.config import jobs
 from bcrl.config import plan as compose
+from bcrl.config import tags
 from bcrl.config.algorithms import fqi
 from bcrl.config.hydra_compose import catalog, composed, read_option
 from bcrl.errors import ConfigError
@@ -49,8 +49,8 @@ OWN = {
 @cache
 def settled(env: str, algorithm: str) -> dict:
     """A composed config of the pair, resolved."""
-    named = ("env.id=CartPole-v1",) if env == jobs.OPEN else ()
-    return jobs._plain(composed((f"env={env}", f"algorithm={algorithm}", *named)))
+    named = ("env.id=CartPole-v1",) if env == tags.OPEN else ()
+    return tags.plain_config(composed((f"env={env}", f"algorithm={algorithm}", *named)))
 
 
 def outcome(make, *arguments, **options):

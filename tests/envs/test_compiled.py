@@ -1,7 +1,9 @@
 """A user's step of one state becomes a step of arrays."""
 
 import math
+import pickle
 
+import cloudpickle
 import numpy as np
 import pytest
 
@@ -41,6 +43,15 @@ def test_it_is_the_step_of_arrays_for_any_leading_axes():
             assert a.shape == b.shape and a.dtype == b.dtype
             np.testing.assert_array_equal(a, b)
     assert np.array_equal(state, kept)
+
+
+def test_it_can_be_sent_to_another_process():
+    given = np.zeros((1, 2)), np.zeros(1, int), np.zeros((1, 1)), (-1.0,), 0.7
+    sent = pickle.loads(cloudpickle.dumps({"step": drift}))["step"]
+    here = pickle.loads(pickle.dumps(sent))  # by its name
+    for found in (sent, here):
+        for a, b in zip(found(*given), drift(*given), strict=True):
+            assert (a == b).all()
 
 
 def test_a_step_that_numba_cannot_compile_is_explained():

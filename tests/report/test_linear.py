@@ -4,11 +4,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from bcrl.common.text import number
 from bcrl.errors import BcrlError
 from bcrl.report.figures import style
 from bcrl.report.figures.linear import figure_4a, figure_4b, pretraining, prior
 from bcrl.report.load import load_runs
-from bcrl.report.tables import number, sweep_sections, sweep_table
+from bcrl.report.tables import sweep_sections, sweep_table
 from tests.report.runs import SEVEN, claims_of, csv_of, report, verdicts_of, write_dqn
 from tests.results.made_up import edit_csv, made_up_plan, reseal, write_seeds
 
@@ -75,7 +76,7 @@ def test_curves_are_the_means_of_the_records(tmp_path):
     """Each method's line covers its target rows only, at steps of all stages."""
     write_dqn(tmp_path)
     left, right = figure_4a(load_runs(tmp_path, "smoke")).axes
-    lines = {x.get_color(): x for x in left.lines if x.get_linewidth() > 1.5}
+    lines = {x.get_color(): x for x in left.lines if x.get_linewidth() > 1.2}
     paths = csv_of(tmp_path, "C-DQN", 0).parent.glob("*.csv")
     tables = [pd.read_csv(path) for path in paths]
     target = tables[0]["stage"] == 2

@@ -14,7 +14,7 @@ import torch
 from bcrl.config.plan import part
 from bcrl.errors import BcrlError
 from bcrl.results.layout import seed_path
-from bcrl.run import costs, progress, records, runner, status
+from bcrl.run import costs, progress, records, runner, status, summary
 from bcrl.run.progress import Progress, Tick
 from bcrl.run.schedule import merged, ordered
 from bcrl.run.workers import cores, do_jobs
@@ -149,5 +149,5 @@ def test_a_changed_result_is_not_complete_and_is_named(tmp_path, suffix):
 
 def test_a_variant_that_diverges_is_named_at_the_end(tmp_path):
     both = [made(tmp_path, range(3), "FQI"), made(tmp_path, range(3), "SBC-FQI", 1e3)]
-    lines = [line for plan in both for line in status.diverging_lines(plan)]
+    lines = [line for plan in both for line in summary.diverging_lines(plan)]
     assert lines == ["hill SBC-FQI, seeds 0–2: q_error diverges"]

@@ -1,7 +1,7 @@
-"""Learning curves: Figures 1, 2 and 5 of the paper, and those of any environment."""
+"""Learning curves of any variants; Figures 1, 2 and 5 of the paper are such."""
 
-import math
-from collections.abc import Callable, Mapping
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +10,16 @@ import yaml
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bcrl.report.figures import style
-from bcrl.report.statistics import bootstrap_curves, standard_error
-from bcrl.report.variants import Methods, Runs, Variant
+from bcrl.report.figures import layout, style
+from bcrl.report.figures.layout import TEXT
+from bcrl.report.variants import Methods, Runs, Variant, listed
+from bcrl.results.statistics import bootstrap_curves
 
+_LABEL_WIDTH = 26  # characters in a line of a y-axis' label
 POINTS = 300  # of a curve that are drawn, about
-_COLUMNS = 3  # panels beside each other
-COUNTED = {"FQI": "iteration", "DQN": "environment steps of all stages"}  # on axes
+COUNTED = {"FQI": "iteration", "DQN": "environment steps"}  # on axes
+BAND = "mean over seeds, band: 95 % bootstrap interval"
 _LABELS = yaml.safe_load(Path(__file__).with_name("labels.yaml").read_text("utf-8"))
-_SEEDS = {"linewidth": 0.5, "linestyle": (0, (3, 2)), "alpha": 0.45, "zorder": 1.9}
-_TWO_ERRORS = "mean ± 2 standard errors over seeds"
-Band = tuple[np.ndarray, np.ndarray]
 
 
 def label(family: str, metric: str) -> str:
@@ -34,10 +33,9 @@ def optimum_of(methods: Methods) -> float | None:
     return optima.pop() if len(optima) == 1 else None
 
 
-def two_errors(values: np.ndarray) -> Band:
-    """Mean ± 2 standard errors of (S, P) values, (P,) each."""
-    centre, half = values.mean(axis=0), 2 * standard_error(values)
-    return centre - half, centre + half
+def all_rows(variant: Variant) -> np.ndarray:
+    """All rows, (I,)."""
+    return np.arange(len(variant.stage))
 
 
 def spread_rows(variant: Variant) -> np.ndarray:
@@ -48,36 +46,39 @@ def spread_rows(variant: Variant) -> np.ndarray:
     return np.unique(np.concatenate([spread, ends, ends + 1]))
 
 
+def target_rows(variant: Variant) -> np.ndarray:
+    """Evenly spread rows of the target task."""
+    return np.intersect1d(spread_rows(variant), variant.target_rows)
+
+
 def draw_metric(
     axes: Axes,
     methods: Methods,
     metric: str,
-    rows: Callable[[Variant], np.ndarray] | None = None,
-    interval: Callable[[np.ndarray], Band] | None = two_errors,
+    rows: Callable[[Variant], np.ndarray] = spread_rows,
+    lines: Mapping[str, style.Line] | None = None,
+    single: bool = False,
 ) -> None:
-    """Every method's mean over seeds with a band, or with all seeds if no `interval`.
-    All rows are drawn unless `rows` chooses some. Diverging curves are cut off."""
-    far, within = [], []
-    for name, variant in methods.items():
-        if metric not in variant.metrics:
-            continue
-        at, line = rows(variant) if rows else slice(None), style.line_of(name)
+    """Every method's mean over seeds with its 95 % interval, or with all seeds if
+    `single`, at some `rows`. `lines`: other looks. Diverging curves are cut off."""
+    found, drawn = lines or style.lines_of(methods), {}
+    shown = {name: v for name, v in methods.items() if metric in v.metrics}
+    for place, (name, variant) in enumerate(shown.items()):
+        at, line = rows(variant), found[name]
         x, values = variant.index[at], variant.metrics[metric][:, at]
-        mean, drawn = values.mean(axis=0), [values]
-        if interval:
-            low, high = interval(values)
-            drawn = [mean, low, high]
-            fill = {"color": line["color"], "alpha": 0.25, "linewidth": 0}
-            axes.fill_between(x, low, high, **fill)
+        mean, colour = values.mean(axis=0), line["color"]
+        if single:
+            drawn[name] = values
+            axes.plot(x, values.T, linewidth=0.5, alpha=0.4, color=colour, zorder=1.9)
         else:
-            axes.plot(x, values.T, **_SEEDS, color=line["color"])
-        axes.plot(x, mean, linewidth=1.6 if interval else 2.0, **line)
-        if metric in variant.far:
-            far.append(name)
-        else:
-            within += drawn
-    if far and within:
-        style.cut(axes, far, within)
+            drawn[name] = np.stack([mean, *bootstrap_curves(values)])
+            axes.fill_between(x, *drawn[name][1:], color=colour, alpha=0.2, linewidth=0)
+        marks = style.marked(len(x), place, len(shown))
+        axes.plot(x, mean, **line, markevery=marks)
+    far = [name for name in drawn if metric in shown[name].far]
+    far += style.strays(metric, {n: v for n, v in drawn.items() if n not in far})
+    if far and len(far) < len(drawn):
+        style.cut(axes, far, [v for name, v in drawn.items() if name not in far])
 
 
 def metrics_of(methods: Methods) -> list[str]:
@@ -93,76 +94,126 @@ def shared_spans(methods: Methods) -> list[style.Span]:
     return spans[0] if all(each == spans[0] for each in spans) else []
 
 
-def _panels(
-    methods: Methods, labels: Mapping[str, str], size: tuple[float, float], **how: Any
+def common_spans(methods: Methods) -> list[style.Span]:
+    """The tasks' extents if there are several and they are those of every variant."""
+    first, *others = (style.task_spans(variant) for variant in methods.values())
+    return first if len(first) > 1 and all(each == first for each in others) else []
+
+
+def draw_panels(
+    methods: Methods,
+    labels: Mapping[str, str],
+    width: float,
+    spans: Sequence[style.Span],
+    **how: Any,
 ) -> tuple[Figure, list[Axes]]:
-    """Panels of `labels`' metrics, tasks shaded; `how` is for `draw_metric`."""
-    figure, n = Figure(figsize=size), len(labels)
-    columns, spans = min(_COLUMNS, n), shared_spans(methods)
-    grid = figure.subplots(math.ceil(n / columns), columns, squeeze=False)
-    for axes in grid.flat[n:]:
-        axes.set_axis_off()
+    """Panels of `labels`' metrics, `spans` shaded; `how` is for `draw_metric`."""
+    figure, found = layout.panels(len(labels), width)
     family = next(variant.family for variant in methods.values())
-    for axes, (metric, ylabel) in zip(grid.flat, labels.items(), strict=False):
+    for axes, (metric, ylabel) in zip(found, labels.items(), strict=True):
         if spans:
             style.shade_tasks(axes, spans)
         draw_metric(axes, methods, metric, **how)
         axes.set(xlabel=COUNTED[family], ylabel=ylabel)
-        axes.margins(x=0.0)
-    return figure, list(grid.flat)
+        axes.margins(x=0.0 if spans else 0.015)
+        style.number_axis(axes)
+    return figure, found
 
 
-def figure_curves(runs: Runs, env: str, family: str, tag: str | None = None) -> Figure:
+def draw_metrics(
+    methods: Methods,
+    metrics: Iterable[str],
+    width: float,
+    target_only: bool = False,
+    lines: Mapping[str, style.Line] | None = None,
+) -> tuple[Figure, list[Axes], str]:
+    """Panels of any variants of one family, tasks shaded where all variants have them
+    at the same time, and what a caption says of the tasks."""
+    family = next(variant.family for variant in methods.values())
+    labels = {m: textwrap.fill(label(family, m), _LABEL_WIDTH) for m in metrics}
+    spans = [] if target_only else common_spans(methods)
+    rows = target_rows if target_only else spread_rows
+    drawn = draw_panels(methods, labels, width, spans, rows=rows, lines=lines)
+    shaded = (
+        ", grey bands: tasks" if spans else ", target task only" if target_only else ""
+    )
+    return *drawn, shaded
+
+
+def figure_metrics(
+    runs: Runs,
+    methods: Methods,
+    metrics: Sequence[str],
+    width: float,
+    target_only: bool = False,
+) -> Figure:
+    """One panel per metric, with a curve and its interval for each of any variants."""
+    figure, found, shaded = draw_metrics(methods, metrics, width, target_only)
+    fqi = all(variant.family == "FQI" for variant in methods.values())
+    optimum = optimum_of(methods) if fqi and "return" in metrics else None
+    if optimum is not None:
+        found[metrics.index("return")].axhline(optimum, **style.OPTIMUM)
+    known = optimum is not None
+    return layout.finish(figure, runs, methods, BAND + shaded, optimum=known)
+
+
+def figure_curves(
+    runs: Runs,
+    env: str,
+    family: str,
+    tag: str | None = None,
+    width: float = TEXT,
+) -> Figure:
     """One panel per metric: mean and 95 % interval of every method, tasks shaded."""
     methods = runs.tagged(env, family, tag)
-    labels = {metric: label(family, metric) for metric in metrics_of(methods)}
-    width = max(0.6, min(_COLUMNS, len(labels)) / 2) * style.TEXT_WIDTH
-    size = width, 2.5 * math.ceil(len(labels) / _COLUMNS) + 0.7
-    how = {"rows": spread_rows, "interval": bootstrap_curves}
-    figure, _ = _panels(methods, labels, size, **how)
-    style.legend(figure, methods)
-    return style.footer(
-        figure, runs, methods, "mean over seeds, bootstrapped 95 % interval"
-    )
+    return figure_metrics(runs, methods, metrics_of(methods), width)
 
 
-def figure_1(runs: Runs, tag: str | None = None) -> Figure:
+def figure_1(runs: Runs, tag: str | None = None, width: float = TEXT) -> Figure:
     """Car on the hill: error and return, every seed and their mean (paper, Fig. 1)."""
     methods = runs.methods("car_on_hill", tag)
     labels = {metric: label("FQI", metric) for metric in ("q_error", "return")}
-    figure, _ = _panels(methods, labels, (style.TEXT_WIDTH, 3.3), interval=None)
-    style.legend(figure, methods)
-    return style.footer(
-        figure, runs, methods, "bold: mean over seeds, dashed: single seeds"
-    )
+    spans = shared_spans(methods)
+    figure, _ = draw_panels(methods, labels, width, spans, rows=all_rows, single=True)
+    what = "bold: mean over seeds, thin: single seeds"
+    return layout.finish(figure, runs, methods, what + _whose(methods))
 
 
-def figure_2(runs: Runs, tag: str | None = None) -> Figure:
+def figure_2(runs: Runs, tag: str | None = None, width: float = TEXT) -> Figure:
     """Maze: the paper's error at s0, the return (paper, Fig. 2) and the exact error.
     The paper's error compares Q(s0, ·) with the *target's* V*(s0) in every stage; the
     exact one averages |Q − Q*| over the states and actions of the current task."""
     methods = runs.methods("maze", tag)
     target = max(int(variant.task.max()) for variant in methods.values())
     labels = {
-        "q_error_start": f"error at the start, V* of T{target}\n"
-        r"mean$_a$ |Q(s$_0$, a) − V*(s$_0$)|",
-        "return": "discounted return",
-        "q_error": "error in the trained task\nmean |Q − Q*|",
+        "q_error_start": f"error at s$_0$\n(V* of T{target})",
+        "return": label("FQI", "return"),
+        "q_error": "error in the\ntrained task",
     }
-    figure, panels = _panels(methods, labels, (1.4 * style.TEXT_WIDTH, 3.2))
+    spans = shared_spans(methods)
+    figure, panels = draw_panels(methods, labels, width, spans, rows=all_rows)
     for axes in panels[::2]:
         axes.set_ylim(bottom=0)
     if (optimum := optimum_of(methods)) is not None:
         panels[1].axhline(optimum, **style.OPTIMUM)
-    style.legend(figure, methods, optimum=optimum is not None)
-    return style.footer(figure, runs, methods, _TWO_ERRORS)
+    errors = "errors: mean over actions of |Q(s$_0$, a) − V*(s$_0$)|, mean |Q − Q*|"
+    what, known = f"{errors}, {BAND}{_whose(methods)}", optimum is not None
+    return layout.finish(figure, runs, methods, what, optimum=known)
 
 
-def figure_5(runs: Runs, tag: str | None = None) -> Figure:
+def figure_5(runs: Runs, tag: str | None = None, width: float = TEXT) -> Figure:
     """Maze: BC-FQI's residual at s0, averaged over actions (paper, Fig. 5)."""
     methods = {"BC-FQI": runs.methods("maze", tag)["BC-FQI"]}
-    labels = {"residual_start": "residual at the start\n" r"mean$_a$ ϱ$_t$(s$_0$, a)"}
-    figure, (axes,) = _panels(methods, labels, (0.75 * style.TEXT_WIDTH, 3.0))
+    labels = {"residual_start": r"mean residual at s$_0$"}
+    spans = shared_spans(methods)
+    figure, (axes,) = draw_panels(methods, labels, width, spans, rows=all_rows)
     axes.axhline(0.0, color="0.6", linewidth=0.6, zorder=1.9)
-    style.legend(figure, methods)
-    return style.footer(figure, runs, methods, _TWO_ERRORS, compares=False)
+    what = f"residual averaged over actions, {BAND}"
+    return layout.finish(figure, runs, methods, what, compares=False)
+
+
+def _whose(methods: Methods) -> str:
+    """Whose tasks are shaded in the paper's figures, if not all methods'."""
+    several = [n for n, v in methods.items() if len(np.unique(v.task)) > 1]
+    partly = several and len(several) < len(methods) and shared_spans(methods)
+    return f", grey bands: tasks of {listed(several)}" if partly else ""

@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 
-from bcrl.report.figures import style
-from bcrl.report.figures.curves import draw_metric
+from bcrl.report.figures import layout, style
+from bcrl.report.figures.curves import BAND, draw_metric
 from bcrl.report.variants import LINEAR, Methods, Runs, Variant
 
 #: A learner's name in the records → in the figures; whose colour it has.
@@ -15,9 +15,9 @@ _LEARNERS = {"lspi": "LSPI", "dqn": "DQN on LQ"}
 _SOURCES = {"lspi": "LSPI", "dqn": "C-DQN"}
 _SHOWN_SEED = {"lspi": 0, "dqn": 10}  # whose Q the paper's Figure 4b shows
 _WORST = -150.0  # target return of a policy that never succeeds: −1 in 150 steps
-_APART = 0.18  # share of the axis below which neighbouring labels take two rows
+_APART = 0.4  # share of the axis below which neighbouring labels take two rows
 _EVERY = 4  # grid points per arrow
-_SMALL = style.SMALL | {"fontsize": 6.5}
+_SMALL = style.SMALL | {"fontsize": style.LABEL}
 
 
 def _pretraining_rows(variant: Variant) -> np.ndarray:
@@ -41,7 +41,7 @@ def _draw_target(axes: Axes, methods: Methods) -> None:
     axes.annotate("never succeeding", (1.0, _WORST), (0, -2), **place, **_SMALL)
     draw_metric(axes, methods, "return", lambda variant: variant.target_rows)
     end = max(int(variant.index[-1]) for variant in methods.values())
-    axes.set(xlim=(0, 1.03 * end), ylabel="return in the target task (undiscounted)")
+    axes.set(xlim=(0, 1.03 * end), ylabel="return in the target task\n(undiscounted)")
     bottom, top = axes.get_ylim()
     axes.set_ylim(bottom=min(bottom, _WORST - 0.07 * (top - _WORST)))  # room for a word
     switches = {
@@ -53,7 +53,7 @@ def _draw_target(axes: Axes, methods: Methods) -> None:
     place = {"xycoords": ("data", "axes fraction"), "ha": "left", "va": "bottom"}
     for step, learner in sorted(switches):
         colour = style.colour(_SOURCES[learner]) if learner in _SOURCES else "0.5"
-        axes.axvline(step, color=colour, linestyle=":")
+        axes.axvline(step, color=colour, linestyle=":", linewidth=1.0)
         raised = 10 if step - previous < _APART * end else 2
         text = f"{_LEARNERS.get(learner, learner)} → target"
         axes.annotate(text, (step, 1.0), (0, raised), **place, **_SMALL)
@@ -66,31 +66,29 @@ def _draw_pretraining(axes: Axes, methods: Methods) -> None:
         source, n = _SOURCES[learner], len(variant.seeds)
         draw_metric(axes, {source: variant}, "discounted_return", _pretraining_rows)
         label = f"{_LEARNERS[learner]}, {n} seed{'s' * (n != 1)}"
-        line = {"color": style.colour(source), "linewidth": 2, "label": label}
-        handles.append(Line2D([], [], **line))
+        (line,) = style.lines_of([source]).values()
+        handles.append(Line2D([], [], label=label, **line))
     if handles:
-        axes.legend(handles=handles, loc="lower right", fontsize=7)
+        axes.legend(handles=handles, loc="lower right")
     else:
         axes.text(0.5, 0.5, "no pretraining", transform=axes.transAxes, **style.EMPTY)
-    axes.set_ylabel("discounted return in the LQ task")
+    axes.set_ylabel("discounted return\nin the LQ task")
     axes.set_title("pretraining", pad=3)
 
 
-def figure_4a(runs: Runs, tag: str | None = None) -> Figure:
+def figure_4a(runs: Runs, tag: str | None = None, width: float = layout.TEXT) -> Figure:
     """Linear system: return against environment steps, and the pretraining's own.
-    Mean ± 2 standard errors over seeds, under the exploring policy (paper, Fig. 4a)."""
+    Mean and 95 % interval over seeds, under the exploring policy (paper, Fig. 4a)."""
     methods = runs.compared(LINEAR, tag, "DQN")
-    figure = Figure(figsize=(1.3 * style.TEXT_WIDTH, 3.5))
-    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
+    figure, grid = layout.blocks(width, (2.0, 1.0), 2.4)
+    left, right = figure.subplots(**grid)
     _draw_target(left, methods)
     _draw_pretraining(right, methods)
     for axes in (left, right):
-        axes.set_xlabel("environment steps, pretraining included")
-        axes.xaxis.set_major_formatter(lambda x, _: f"{x:,.0f}".replace(",", "\u2009"))
-        axes.locator_params(axis="x", nbins=6)
-    style.legend(figure, methods)
-    what = "mean ± 2 standard errors over seeds, exploring policy; dotted: new task"
-    return style.footer(figure, runs, methods, what)
+        axes.set_xlabel("environment steps")
+        style.number_axis(axes)
+    what = f"{BAND}, exploring policy, steps of pretraining included, dotted: new task"
+    return layout.finish(figure, runs, methods, what)
 
 
 def prior(variant: Variant, seed: int) -> tuple[np.ndarray, ...]:
@@ -103,7 +101,7 @@ def prior(variant: Variant, seed: int) -> tuple[np.ndarray, ...]:
 
 
 def _draw_prior(axes: Axes, learner: str, variant: Variant | None) -> None:
-    title = rf"{learner.upper()}: max$_a$ Q in the LQ task"
+    title = "max$_a$ Q in the LQ task\n" + learner.upper()
     if variant is None:
         axes.set_title(title, pad=4)
         axes.set(xlim=(-5, 5), ylim=(-5, 5))
@@ -140,30 +138,28 @@ def _draw_environment(axes: Axes, variant: Variant) -> None:
     if speed > 0:
         axes.quiver(middle, (y0 + y1) / 2, *(drift / speed), scale=6, width=0.012)
         names.append((f"drift {speed:g}", middle))
-    small = {"fontsize": 6.5, "textcoords": "offset points"}
+    small = {"fontsize": style.LABEL, "textcoords": "offset points"}
     for name, x in names:
         axes.annotate(name, (x, y1), (0, 2), ha="center", va="bottom", **small)
-    for text, at, shift, side in (
-        ("off the pathway: back to the start", (middle, y0), (0, -6), "center"),
-        ("wall, reflecting", (x0, top), (4, -3), "left"),
-        ("wall, reflecting", (x1, top), (-4, -3), "right"),
-    ):
-        axes.annotate(text, at, shift, ha=side, va="top", **small)
+    for x, shift, side in ((x0, (4, -3), "left"), (x1, (-4, -3), "right")):
+        axes.annotate("wall", (x, top), shift, ha=side, va="top", **small)
 
 
-def figure_4b(runs: Runs, tag: str | None = None) -> Figure:
+def figure_4b(runs: Runs, tag: str | None = None, width: float = layout.TEXT) -> Figure:
     """Linear system: both priors' values and greedy actions, and the target task.
     Q in the LQ task on the plane of positions at zero velocity (paper, Fig. 4b)."""
     methods = runs.compared(LINEAR, tag, "DQN")
     found = pretraining(methods)
-    figure = Figure(figsize=(1.45 * style.TEXT_WIDTH, 3.8))  # widths decide
+    figure, grid = layout.blocks(width, (1.15, 1.15, 1.0), 2.3)
     names = {"xlabel": "position x", "ylabel": "position y", "aspect": "equal"}
-    panels = figure.subplots(1, 3, width_ratios=(1.15, 1.15, 1), subplot_kw=names)
+    panels = figure.subplots(**grid, subplot_kw=names)
     for axes, learner in zip(panels, _LEARNERS, strict=False):
         _draw_prior(axes, learner, found.get(learner))
     variant = next(iter(methods.values()))
     _draw_environment(panels[2], variant)
     shown = {v.method: v for v in found.values()} or {variant.method: variant}
-    what = "one seed per panel, own colour scales; "
-    what += "arrows: greedy action at zero velocity"
-    return style.footer(figure, runs, shown, what, compares=False)
+    what = "one seed per panel, own colour scales; arrows: greedy action at zero "
+    what += (
+        "velocity; target: walls reflect, an agent off the pathway returns to its start"
+    )
+    return layout.caption(figure, runs, shown, what, compares=False)

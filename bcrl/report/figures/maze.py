@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Rectangle
 
-from bcrl.report.figures import style
+from bcrl.report.figures import layout, style
 from bcrl.report.variants import METHODS, Methods, Runs, Variant
 
 _MARGIN = 0.025  # half a lattice cell
@@ -56,7 +56,7 @@ def _draw_paths(axes: Axes, name: str, variant: Variant, goal: np.ndarray) -> No
         (path,) = variant.arrays(seed, "trajectory")  # (L, 2)
         axes.plot(path[:, 0] + shift, path[:, 1] - shift, **look)
     _draw_ends(axes, goal, path[0])
-    _frame(axes, f"{name}: {int(variant.last('solved').sum())} of {n} arrive")
+    _frame(axes, f"{name}: {int(variant.last('solved').sum())}/{n}")
 
 
 def _grid(panel: SubFigure, methods: Methods) -> Iterator[tuple[Axes, str, Variant]]:
@@ -69,23 +69,23 @@ def _grid(panel: SubFigure, methods: Methods) -> Iterator[tuple[Axes, str, Varia
             axes.text(0.5, 0.5, "no runs", **style.EMPTY)
 
 
-def figure_3(runs: Runs, tag: str | None = None) -> Figure:
+def figure_3(runs: Runs, tag: str | None = None, width: float = layout.TEXT) -> Figure:
     """Mazes, max_a of the seed-mean Q on the target, greedy episodes (paper, Fig. 3).
     Values are drawn inside walls too, where no data lay; colour scales differ."""
     methods = runs.methods("maze", tag)
     reference = max(methods.values(), key=lambda v: len(np.unique(v.task)))
     names = ("walls", "goal", "trajectory")
     walls, goal, path = reference.arrays(reference.seeds[0], *names)
-    figure, target = Figure(figsize=(11.4, 4.2)), f"T{len(walls)}"
-    figure.get_layout_engine().set(w_pad=0.07)
+    figure, grid = layout.blocks(width, (1.0, 1.28, 1.0), 2.6)
+    panels = figure.subfigures(**grid)
+    target = f"T{len(walls)}"
     titles = (
-        "(a) tasks of the curriculum",
-        rf"(b) max$_a$ of the seed-mean Q(s, a) on {target}",
-        f"(c) greedy episodes in {target}, last iteration",
+        "(a) curriculum",
+        rf"(b) max$_a$ Q(s, a) on {target}",
+        f"(c) greedy episodes on {target}",
     )
-    panels = figure.subfigures(1, 3, width_ratios=(1.0, 1.28, 1.0), wspace=0.03)
     for panel, title in zip(panels, titles, strict=True):
-        panel.suptitle(title, fontsize=9)
+        panel.suptitle(title, fontsize=8)
     shown = np.linspace(0, len(walls) - 1, 4).round().astype(int)
     for axes, task in zip(panels[0].subplots(2, 2).flat, shown, strict=True):
         _draw_walls(axes, walls[task])
@@ -100,5 +100,6 @@ def figure_3(runs: Runs, tag: str | None = None) -> Figure:
     for axes, name, variant in _grid(panels[2], methods):
         _draw_walls(axes, walls[-1])
         _draw_paths(axes, name, variant, goal)
-    what = "circle: start, star: goal; in (c) seeds are drawn side by side"
-    return style.footer(figure, runs, methods, what)
+    what = "circle: start, star: goal; (b) mean Q over seeds; (c) after the last "
+    what += "iteration, seeds side by side, with the share that arrives"
+    return layout.caption(figure, runs, methods, what)

@@ -1,0 +1,301 @@
+"""`bcrl-report --compare` and `--sweep`: figures of any runs, on made-up ones."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from PIL import Image
+
+from bcrl.errors import BcrlError
+from bcrl.report.choose import folders_of, labelled
+from bcrl.report.figures import style
+from bcrl.report.figures.curves import figure_metrics
+from bcrl.report.figures.layout import TEXT, inches
+from bcrl.report.figures.sweep import figure_final, figure_map, figure_sweep
+from bcrl.report.load import load_chosen
+from bcrl.report.sweeps import sweeps_of
+from bcrl.report.variants import Methods, Runs
+from bcrl.results.layout import seed_path
+from tests.report.runs import as_claimed, report, write_dqn, write_fqi
+from tests.results.made_up import made_up_plan, reseal, write_seeds
+
+TAGGED = ("FQI", "BC-FQI", "BC-FQI@a", "BC-FQI@b")
+COLUMN = inches("column")
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> Path:
+    """The maze's four methods, two tags of BC-FQI, and two DQNs; not to be changed."""
+    root = tmp_path_factory.mktemp("chosen") / "runs"
+    write_fqi(root, "maze", seeds=3)
+    for tag in ("@a", "@b"):
+        write_fqi(root, "maze", seeds=3, methods=("BC-FQI",), tag=tag)
+    write_dqn(root, ("DQN", "BC-DQN"), range(3))
+    return root
+
+
+def chosen(root: Path, *names: str, env: str | None = None) -> tuple[Runs, Methods]:
+    """The runs of these names and their labels."""
+    runs = load_chosen(folders_of(root, "smoke", env, names))
+    return runs, labelled(runs.variants)
+
+
+def legend_of(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_files_have_the_asked_size_in_print(written, tmp_path):
+    words = ["--compare", "FQI", "BC-FQI@a", "env=maze", "--metrics", "solved"]
+    for width, size in (("column", 3.25), ("5", 5.0)):
+        out = tmp_path / width
+        kinds = ["svg", "png", "pdf"][: 3 if width == "column" else 2]
+        words += ["--format", ",".join(kinds), "--width", width, "--out", str(out)]
+        assert report(written, *words) == 0
+        path = out / "compare_maze_smoke_solved.png"
+        assert {p.suffix[1:] for p in out.iterdir()} == set(kinds)
+        with Image.open(path) as picture:
+            assert picture.width / picture.info["dpi"][0] == pytest.approx(
+                size, abs=0.01
+            )
+        svg = re.search(r'width="([\d.]+)pt"', path.with_suffix(".svg").read_text())
+        assert float(svg[1]) == pytest.approx(72 * size)
+    pdf = (tmp_path / "column/compare_maze_smoke_solved.pdf").read_bytes()
+    assert float(re.search(rb"/MediaBox \[ *0 0 ([\d.]+)", pdf)[1]) == 234.0
+
+
+def test_type_and_panels_keep_their_size_at_any_width(written):
+    runs, methods = chosen(written, *TAGGED)
+    for width in (COLUMN, TEXT):
+        figure = figure_metrics(runs, methods, ["return"], width)
+        (axes,) = figure.axes
+        texts = [axes.xaxis.label, axes.yaxis.label, *axes.get_xticklabels()]
+        texts += figure.legends[0].get_texts()
+        assert {text.get_fontsize() for text in texts} == {8.0}
+        figure.draw_without_rendering()
+        assert axes.get_window_extent().height / figure.dpi > 1.0
+        box = figure.legends[0].get_window_extent()
+        assert box.x0 >= 0 and box.x1 <= width * figure.dpi
+
+
+def test_the_named_variants_are_drawn_and_differ_in_grey(written):
+    runs, methods = chosen(written, *TAGGED)
+    figure = figure_metrics(runs, methods, ["return"], COLUMN)
+    assert legend_of(figure) == [*TAGGED, "optimum of the target"]
+    axes = figure.axes[0]
+    means = [line for line in axes.lines if line.get_marker() != "None"]
+    for name, line in zip(TAGGED, means, strict=True):
+        tables = [pd.read_csv(p) for p in (written / "smoke/maze" / name).glob("*.csv")]
+        expected = np.mean([table["return"] for table in tables], axis=0)
+        np.testing.assert_allclose(line.get_ydata(), expected)
+        assert line.get_color() == style.colour(name)
+    looks = {(x.get_marker(), x._unscaled_dash_pattern) for x in means}
+    assert len(looks) == len(TAGGED)
+
+
+def test_every_method_has_a_look_of_its_own_without_colours():
+    names = [
+        "FQI",
+        "C-FQI",
+        "B-FQI",
+        "BC-FQI",
+        "SC-DQN",
+        "SBC-DQN",
+        "RPL",
+        "PPR",
+        "OWN",
+    ]
+    names += [f"BC-FQI@{n}" for n in range(5)]
+    looks = style.lines_of(names)
+    assert len({(x["linestyle"], x["marker"]) for x in looks.values()}) == len(names)
+    assert {looks[name]["color"] for name in names[-5:]} == {style.colour("BC-FQI")}
+    assert style.lines_of(["BC-FQI"])["BC-FQI"] == looks["BC-FQI"]
+
+
+@pytest.mark.parametrize(
+    ("names", "shaded"),
+    [(("C-FQI", "BC-FQI@a"), 10), (("FQI", "BC-FQI"), 0), (("FQI", "B-FQI"), 0)],
+)
+def test_tasks_are_shaded_where_they_are_those_of_all_curves(written, names, shaded):
+    runs, methods = chosen(written, *names)
+    figure = figure_metrics(runs, methods, ["return"], TEXT)
+    names = [text for text in figure.axes[0].texts if text.get_text()[0] == "T"]
+    assert len(names) == shaded
+    assert ("tasks" in figure.get_label()) == bool(shaded)
+    assert "bootstrap" in figure.get_label()
+
+
+def test_runs_of_any_folder_can_be_compared(written, tmp_path):
+    write_fqi(tmp_path / "other", "maze", seeds=2, methods=("BC-FQI",))
+    far = tmp_path / "other/smoke/maze/BC-FQI"
+    runs, methods = chosen(written, f"{far}/", "BC-FQI", env="maze")
+    assert [variant.folder for variant in methods.values()] == [
+        far,
+        written / "smoke/maze/BC-FQI",
+    ]
+    assert len(methods) == 2 and all("BC-FQI (" in name for name in methods)
+    figure = figure_metrics(runs, methods, ["q_error"], COLUMN)
+    (first, second), note = methods, figure.get_label()
+    assert f"seeds differ: 0–1: {first}; 0–2: {second}" in note
+
+
+def test_patterns_name_several_variants_once(written):
+    found = folders_of(written, "smoke", None, ["BC-FQI@b", "BC-FQI*"])
+    assert [path.name for path in found] == ["BC-FQI@b", "BC-FQI", "BC-FQI@a"]
+
+
+def test_steps_are_counted_for_dqn_and_a_target_can_be_drawn_alone(written):
+    runs, methods = chosen(written, "DQN", "BC-DQN")
+    figure = figure_metrics(runs, methods, ["return"], COLUMN, target_only=True)
+    assert figure.axes[0].get_xlabel() == "environment steps"
+    starts = [line.get_xdata()[0] for line in figure.axes[0].lines]
+    assert starts == [500, 2000]
+
+
+WRONG = [
+    (["--compare", "BC-FQ"], ["BC-FQ:", "BC-FQI?", "maze: B-FQI, BC-FQI, BC-FQI@a"]),
+    (["--compare", "BC-FQI", "DQN"], ["DQN", "maze"]),
+    (
+        ["--sweep", "algorithm.episodes", "--env", "mase"],
+        ["mase", "linear_system, maze"],
+    ),
+    (["--compare", "./nowhere"], ["nowhere", "is not a folder"]),
+    (["--compare", "FQI", "--metrics", "retrun"], ["retrun", "return", "solved"]),
+    (["--compare", "FQI", "--width", "wide"], ["wide", "column", "text"]),
+    (["--compare", "FQI", "--format", "gif"], ["gif", "png, pdf, svg"]),
+    (["--compare", "FQI", "--tag", "a"], ["--tag"]),
+    (["--metrics", "return"], ["--metrics", "--compare"]),
+    (["--sweep", "algorithm.episode", "env=maze"], ["algorithm.episode:"]),
+    (["--sweep", "a", "b", "c", "env=maze"], ["a b c", "two"]),
+]
+
+
+@pytest.mark.parametrize(("words", "told"), WRONG)
+def test_what_is_not_there_gets_an_error_that_lists_what_is(
+    written, tmp_path, capsys, words, told
+):
+    assert report(written, *words, "--out", str(tmp_path / "out")) == 2
+    error = capsys.readouterr().err
+    assert all(text in error for text in told)
+    assert not list(tmp_path.glob("out/*"))
+
+
+def test_two_counters_are_not_drawn_in_one_figure(written, capsys):
+    paths = [str(written / "smoke/maze/FQI"), str(written / "smoke/linear_system/DQN")]
+    assert report(written, "--compare", *paths) == 2
+    assert "iterations" in capsys.readouterr().err
+
+
+def test_a_caption_of_its_own_file_leaves_what_is_incomplete_in_the_figure(
+    tmp_path, capsys
+):
+    write_fqi(tmp_path, "maze", seeds=3, methods=("FQI", "C-FQI"))
+    reseal(seed_path(tmp_path / "smoke/maze/FQI", 1, "json"), status="running")
+    words = ["--compare", "FQI", "--metrics", "return", "--format", "svg"]
+    assert report(tmp_path, *words) == 2
+    assert "--allow-incomplete" in capsys.readouterr().err
+    assert report(tmp_path, "--compare", "C-FQI", *words[2:]) == 0  # is complete
+    words += ["--caption-file", "--name", "mine", "--allow-incomplete"]
+    assert report(tmp_path, *words) == 0
+    text = (tmp_path / "figures/mine_return.txt").read_text()
+    assert "INCOMPLETE: FQI 2 of 3 seeds" in text and "bootstrap" in text
+    svg = (tmp_path / "figures/mine_return.svg").read_text()
+    drawn = re.findall(r"<!-- (.+?) -->", svg)  # each text is also a comment
+    assert any("INCOMPLETE" in line for line in drawn)
+    assert not any("bootstrap" in line for line in drawn)
+
+
+def write_sweep(root: Path, settings: dict[str, dict], method: str = "FQI") -> None:
+    """A variant per tag, whose last return is minus its number of episodes."""
+    for tag, algorithm in settings.items():
+        config = {"algorithm": {"name": "fqi", "episodes": 5, "loss": "l2"} | algorithm}
+        plan = made_up_plan(root, "mine", f"{method}@{tag}", range(3), config=config)
+        last = -config["algorithm"]["episodes"]
+        rows = {"stage": 1, "task": 1, "iteration": [1, 2], "return": [-9.0, last]}
+        write_seeds(plan, lambda seed, rows=rows: pd.DataFrame(rows))
+
+
+def test_a_sweep_is_coloured_by_value_and_its_ends_have_a_logarithmic_axis(tmp_path):
+    episodes = {"d": 1000, "b": 10, "a": 1, "c": 100}
+    write_sweep(tmp_path, {tag: {"episodes": n} for tag, n in episodes.items()})
+    runs, methods = chosen(tmp_path, "*")
+    (sweep,) = sweeps_of([*methods.values()], ["algorithm.episodes"])
+    figure = figure_sweep(runs, sweep, "return", COLUMN)
+    assert legend_of(figure) == ["1", "10", "100", "1000"]
+    colours = [to_hex(line.get_color()) for line in figure.axes[0].lines]
+    greys = [
+        np.dot([0.3, 0.6, 0.1], Image.new("RGB", (1, 1), c).getpixel((0, 0)))
+        for c in colours
+    ]
+    assert greys == sorted(greys) and len(set(greys)) == 4
+    axes = figure_final(runs, [sweep], "return", COLUMN).axes[0]
+    line = axes.lines[0]
+    assert axes.get_xscale() == "log"
+    assert [*line.get_xdata()] == [1, 10, 100, 1000]
+    assert [*line.get_ydata()] == [-1, -10, -100, -1000]
+
+
+def test_many_values_have_a_colour_bar_and_words_an_axis_of_their_own(tmp_path):
+    write_sweep(tmp_path, {f"e{n}": {"episodes": n} for n in range(3, 10)})
+    runs, methods = chosen(tmp_path, "*")
+    (sweep,) = sweeps_of([*methods.values()], ["algorithm.episodes"])
+    figure = figure_sweep(runs, sweep, "return", COLUMN)
+    assert not figure.legends and figure.axes[1].get_ylabel() == "algorithm.episodes"
+    losses = {"x": {"loss": "l1"}, "y": {"loss": [2, 3]}}
+    write_sweep(tmp_path, losses, "C-FQI")
+    runs, methods = chosen(tmp_path, "C-FQI*")
+    sweeps = sweeps_of([*methods.values()], ["algorithm.loss"])
+    axes = figure_final(runs, sweeps, "return", COLUMN).axes[0]
+    assert axes.get_xscale() == "linear"
+    assert [t.get_text() for t in axes.get_xticklabels()] == ["[2, 3]", "l1"]
+
+
+def test_two_keys_give_a_map_and_other_settings_sweeps_of_their_own(tmp_path, capsys):
+    cells = [(n, loss) for n in (5, 50) for loss in ("l1", "l2")][:3]
+    write_sweep(tmp_path, {f"{n}{x}": {"episodes": n, "loss": x} for n, x in cells})
+    runs, methods = chosen(tmp_path, "*")
+    both = ["algorithm.episodes", "algorithm.loss"]
+    (sweep,) = sweeps_of([*methods.values()], both)
+    axes, bar = figure_map(runs, sweep, "return", COLUMN).axes
+    np.testing.assert_array_equal(
+        axes.images[0].get_array().filled(np.nan), [[-5, -50], [-5, np.nan]]
+    )
+    assert {text.get_text() for text in axes.texts} == {"−5.00", "−50.0", "–"}
+    assert bar.get_ylabel() == "discounted return"
+    write_sweep(tmp_path, {"rest": {"episodes": 50, "loss": "l2"}})
+    methods = chosen(tmp_path, "*")[1]
+    labels = [s.label for s in sweeps_of([*methods.values()], both[:1])]
+    assert sorted(labels) == ["FQI, loss=l1", "FQI, loss=l2"]
+    with pytest.raises(
+        BcrlError, match=r"env\.name.*algorithm\.episodes and algorithm\.loss"
+    ):
+        sweeps_of([*methods.values()], ["env.name"])
+    words = ["--sweep", *both, "--metrics", "return", "--format", "svg"]
+    assert report(tmp_path, *words) == 0
+    (path,) = capsys.readouterr().out.split()
+    assert Path(path).name == "sweep_mine_smoke_FQI_return.svg"
+
+
+def test_one_diverging_method_is_cut_off_and_a_success_is_not(tmp_path):
+    curves = {"A": np.array([-50.0, -40]), "B": np.array([-60.0, -45])}
+    assert style.strays("return", curves | {"C": np.array([-50.0, -1e6])}) == ["C"]
+    assert style.strays("return", curves | {"C": np.array([-1e6]), "D": -curves["A"]})
+    weak = {"A": np.array([0.0, 1e-4]), "B": np.array([0.0, 0.0])}
+    assert style.strays("return", weak | {"C": np.array([0.0, 0.9])}) == []
+    assert style.strays("loss", weak | {"C": np.array([0.0, 0.9])}) == ["C"]
+    assert style.strays("loss", {"A": np.array([np.nan]), "B": np.array([1.0])}) == []
+
+    def far(env, method, seed, stage):
+        found = as_claimed(env, method, seed, stage)
+        if method == "C-FQI":
+            found["return"] = found["return"] * 1e6
+        return found
+
+    write_fqi(tmp_path, "maze", seeds=2, curves=far)
+    runs, methods = chosen(tmp_path, "FQI", "C-FQI", "B-FQI")
+    axes = figure_metrics(runs, methods, ["return"], COLUMN).axes[0]
+    assert axes.get_ylim()[0] > -200
+    assert "cut: C-FQI diverges" in {text.get_text() for text in axes.texts}
