@@ -2,23 +2,43 @@
 
 import base64
 import hashlib
+import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
+from PIL import Image
 
 from bcrl import __version__
 from bcrl.common.identity import as_text, differences, flat, identity
+from bcrl.report.claims import EXPECTED, FAILS, HOLDS, UNEXPECTED, verdict_counts
 from bcrl.report.curve_data import curve_data
-from bcrl.report.tables import ABSENT, PARAGRAPHS, Section, TextTable, duration, number
-from bcrl.report.variants import Pair, Runs, env_title, incomplete
+from bcrl.report.tables import (
+    ABSENT,
+    GLOSSARY,
+    PARAGRAPHS,
+    TASKS,
+    Section,
+    TextTable,
+    duration,
+    number,
+)
+from bcrl.report.variants import Pair, Runs, Variant, env_title, incomplete
 from bcrl.results.layout import seed_path, spelled
 
 Picture = tuple[Path, str]  # an image file and what it shows
+#: The page's cards of claims: title → verdict → its word after a number.
+_COUNTED = {
+    "claims": {HOLDS: "hold", FAILS: "do not hold", "undecided": "undecided"},
+    "claims, too few seeds to judge": {
+        EXPECTED: "as expected",
+        UNEXPECTED: "not as expected",
+    },
+}
 
 
 def page(
@@ -33,6 +53,7 @@ def page(
     browsers that run no scripts; `agents` move."""
     notes = runs.notes_on(tag)
     given = {"version": __version__, "texts": PARAGRAPHS, "runs": runs, "tag": tag}
+    given |= {"glossary": GLOSSARY, "about_tasks": TASKS}
     given |= {"figures": figures, "claims": claims, "agents": agents, "sweeps": sweeps}
     given |= {"notes": notes, "incomplete": incomplete(notes)}
     return _JINJA.get_template("page.html").render(
@@ -41,6 +62,7 @@ def page(
         costs=costs(runs),
         configs=configurations(runs),
         provenance=seed_origins(runs),
+        tasks={pair: task_values(runs.of(*pair)) for pair in runs.pairs},
         curves=[curve_data(runs, env, family, tag) for env, family in runs.pairs],
     )
 
@@ -49,18 +71,38 @@ def _facts(runs: Runs, claims: Mapping[Pair, Section]) -> dict[str, object]:
     """What the page's head says in numbers."""
     parts = [part for section in claims.values() for part in section.parts]
     rows = [row for part in parts if isinstance(part, TextTable) for row in part.rows]
-    verdicts = [row["verdict"] for row in rows if "verdict" in row]
+    counts = verdict_counts(row for row in rows if "verdict" in row)
     facts = {
         "environments": len({env for env, _ in runs.pairs}),
         "variants": len(runs.variants),
         "complete seeds": sum(len(v.seeds) for v in runs.variants),
         "CPU time": duration(sum(v.cpu_seconds for v in runs.variants)),
     }
-    if verdicts:
-        holds, fails = verdicts.count("holds"), verdicts.count("does not hold")
-        counted = f"{holds} · {fails} · {len(verdicts) - holds - fails}"
-        facts["claims that hold · do not · undecided"] = counted
+    for title, words in _COUNTED.items():
+        found = {word: counts.pop(verdict, 0) for verdict, word in words.items()}
+        if any(found.values()):
+            facts[title] = ", ".join(f"{n} {word}" for word, n in found.items() if n)
+    if counts:
+        facts["claims without data"] = counts.total()
     return facts
+
+
+def task_values(variants: Iterable[Variant]) -> dict[tuple[str, ...], str]:
+    """Each task's values as text → the variants that have these tasks."""
+    found: dict[tuple[str, ...], list[str]] = {}
+    for variant in variants:
+        varied = variant.config["env"].get("tasks") or {}
+        lists = {name: values for name, values in varied.items() if values is not None}
+        tasks = (dict(zip(lists, task, strict=True)) for task in zip(*lists.values()))
+        texts = (
+            # A simulator's attributes and arguments go by their own names.
+            ", ".join(
+                f"{k.rpartition('.')[2]} {as_text(v)}" for k, v in flat(t).items()
+            )
+            for t in tasks
+        )
+        found.setdefault(tuple(texts), []).append(variant.name)
+    return {tasks: ", ".join(names) for tasks, names in found.items() if tasks}
 
 
 def costs(runs: Runs) -> list[str | TextTable]:
@@ -118,7 +160,7 @@ def seed_origins(runs: Runs) -> list[str | TextTable]:
         when = f"{dates[0]:%Y-%m-%d %H:%M} – {dates[-1]:%Y-%m-%d %H:%M} UTC"
         row = {"seeds": ", ".join(who), "revision": revision, "versions": versions}
         rows.append(row | {"machine": machine, "finished (files' dates)": when})
-    return [TextTable(rows)]
+    return [PARAGRAPHS["provenance"], TextTable(rows)]
 
 
 def _origin(sidecar: dict[str, Any]) -> tuple[str, ...]:
@@ -142,6 +184,13 @@ def _url(image: Path) -> str:
     return f"data:image/{image.suffix[1:]};base64,{data}"
 
 
+def _still(animation: Path) -> str:
+    """The first frame as the URL of a PNG."""
+    with Image.open(animation) as image, io.BytesIO() as kept:
+        image.save(kept, "PNG")
+        return f"data:image/png;base64,{base64.b64encode(kept.getvalue()).decode()}"
+
+
 def _prose(text: str) -> Markup:
     """Escaped text, with the emphasis and code that the Markdown documents use."""
     html = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", str(escape(text)))
@@ -158,5 +207,5 @@ _BLOCKS = {"undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": T
 _JINJA = Environment(loader=PackageLoader("bcrl.report"), autoescape=True, **_BLOCKS)
 _STRICT = {"separators": (",", ":"), "allow_nan": False, "ensure_ascii": False}
 _JINJA.policies["json.dumps_kwargs"] = _STRICT
-_JINJA.filters |= {"prose": _prose, "url": _url, "sha256": _sha256}
+_JINJA.filters |= {"prose": _prose, "url": _url, "still": _still, "sha256": _sha256}
 _JINJA.filters["env_title"] = env_title
