@@ -75,7 +75,7 @@ MEASURES = {
     "residual from T7 to T10": lambda v: _residual(v, 7, 10),
     "late return": lambda v: v.late("return"),
 }
-#: Verdicts; others have no word of their own here.
+#: Verdicts that the page counts, besides `undecided`.
 HOLDS, FAILS = "holds", "does not hold"
 EXPECTED = "as expected, too few seeds to judge"
 UNEXPECTED = "not as expected, too few seeds to judge"

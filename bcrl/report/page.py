@@ -93,14 +93,12 @@ def task_values(variants: Iterable[Variant]) -> dict[tuple[str, ...], str]:
     for variant in variants:
         varied = variant.config["env"].get("tasks") or {}
         lists = {name: values for name, values in varied.items() if values is not None}
-        tasks = (dict(zip(lists, task, strict=True)) for task in zip(*lists.values()))
-        texts = (
+        texts = []
+        for values in zip(*lists.values(), strict=True):
+            task = flat(dict(zip(lists, values, strict=True)))
             # A simulator's attributes and arguments go by their own names.
-            ", ".join(
-                f"{k.rpartition('.')[2]} {as_text(v)}" for k, v in flat(t).items()
-            )
-            for t in tasks
-        )
+            each = (f"{k.rpartition('.')[2]} {as_text(v)}" for k, v in task.items())
+            texts.append(", ".join(each))
         found.setdefault(tuple(texts), []).append(variant.name)
     return {tasks: ", ".join(names) for tasks, names in found.items() if tasks}
 
@@ -198,6 +196,11 @@ def _prose(text: str) -> Markup:
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", html))
 
 
+def _breakable(key: str) -> Markup:
+    """Escaped text whose dotted keys can go over several lines."""
+    return Markup(re.sub(r"([._])(?=\w)", r"\1<wbr>", str(escape(key))))
+
+
 def _sha256(text: str) -> str:
     """A style's or script's hash, by which a content security policy allows it."""
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
@@ -208,4 +211,4 @@ _JINJA = Environment(loader=PackageLoader("bcrl.report"), autoescape=True, **_BL
 _STRICT = {"separators": (",", ":"), "allow_nan": False, "ensure_ascii": False}
 _JINJA.policies["json.dumps_kwargs"] = _STRICT
 _JINJA.filters |= {"prose": _prose, "url": _url, "still": _still, "sha256": _sha256}
-_JINJA.filters["env_title"] = env_title
+_JINJA.filters |= {"breakable": _breakable, "env_title": env_title}

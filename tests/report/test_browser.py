@@ -316,7 +316,7 @@ def test_all_of_it_is_printed(page):
 
 
 def test_animations_stop(page):
-    """At once where motion is reduced, else by a button; there, too, it can be played."""
+    """At once where motion is reduced, else by a button, which also plays them."""
     moving = "return document.querySelector('.moving img').currentSrc.slice(5, 14)"
     for value, kinds in (("reduce", ("png", "gif")), ("no-preference", ("gif", "png"))):
         page.media("prefers-reduced-motion", value)

@@ -257,8 +257,9 @@
       const inside = svg("g", { "clip-path": `url(#${clip})` });
       root.append(inside);
       if (optimum !== null) {
-        const d = `M${MARGIN.left} ${toY(optimum)}H${right}`;
-        const at = { x: right - 3, y: toY(optimum) - 4, "text-anchor": "end" };
+        const y = toY(optimum), above = y > MARGIN.top + 15;
+        const at = { x: right - 3, y: above ? y - 4 : y + 12, "text-anchor": "end" };
+        const d = `M${MARGIN.left} ${y}H${right}`;
         inside.append(svg("path", { d, class: "optimum" }), svg("text", at, "optimum"));
       }
       for (const each of lines) {
