@@ -178,15 +178,18 @@ def _origin(sidecar: dict[str, Any]) -> tuple[str, ...]:
 
 def _url(image: Path) -> str:
     """The whole file as a URL."""
-    data = base64.b64encode(image.read_bytes()).decode()
-    return f"data:image/{image.suffix[1:]};base64,{data}"
+    return _data_url(image.read_bytes(), image.suffix[1:])
 
 
 def _still(animation: Path) -> str:
     """The first frame as the URL of a PNG."""
     with Image.open(animation) as image, io.BytesIO() as kept:
         image.save(kept, "PNG")
-        return f"data:image/png;base64,{base64.b64encode(kept.getvalue()).decode()}"
+        return _data_url(kept.getvalue(), "png")
+
+
+def _data_url(image: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"
 
 
 def _prose(text: str) -> Markup:

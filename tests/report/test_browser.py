@@ -243,6 +243,9 @@ def test_fingers(page):
 
     tap(f"{RETURN} svg")
     assert len(page.values(RETURN)) == 4
+    tap("#runs-1 [data-metric=q_error] svg")
+    assert len(page.values("#runs-1 [data-metric=q_error]")) == 4
+    assert page.all(f"{RETURN} .tip") == []
     shown = page.texts(f"{RETURN} text")
     tap("#runs-1 [aria-label='zoom in']")
     assert page.texts(f"{RETURN} text") != shown

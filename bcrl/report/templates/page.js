@@ -347,10 +347,6 @@
         if (from === null && event.pointerType !== "touch") this.leave();
       });
       view.svg.addEventListener("pointerdown", (event) => {
-        if (event.pointerType === "touch") {
-          this.point(view, dataX(event));
-          this.say(view);
-        }
         if (event.pointerType !== "mouse" || event.button) return;
         from = dataX(event);
         view.svg.setPointerCapture(event.pointerId);
@@ -361,6 +357,11 @@
         if (start === null) return;
         const ends = [start, dataX(event)].sort((a, b) => a - b);
         if (ends[1] - ends[0] > (x1 - x0) / 50) this.zoom(ends);
+      });
+      view.svg.addEventListener("click", (event) => { // also a tap, after what it blurs
+        if (!this.views.includes(view)) return;
+        this.point(view, dataX(event));
+        this.say(view);
       });
       view.svg.addEventListener("dblclick", () => this.zoom(null));
       view.svg.addEventListener("blur", () => this.leave());
