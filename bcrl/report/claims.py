@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +77,11 @@ MEASURES = {
     "residual from T7 to T10": lambda v: _residual(v, 7, 10),
     "late return": lambda v: v.late("return"),
 }
+#: Verdicts that the page counts, besides `undecided`.
+HOLDS, FAILS = "holds", "does not hold"
+EXPECTED = "as expected, too few seeds to judge"
+UNEXPECTED = "not as expected, too few seeds to judge"
+
 _STATISTICS = {"deviation of return": np.std}  # of others the mean over seeds
 
 _TEXT = Path(__file__).with_name("claims.yaml").read_text("utf-8")
@@ -94,30 +99,34 @@ def claims_report(runs: Runs, tag: str | None, claims: Iterable[Section]) -> str
     parts: list[object] = [f"# The paper's claims, scale {runs.scale}{tagged}\n"]
     if lacking := incomplete(notes):
         parts.append(f"**{lacking}**\n")
-    parts += [PARAGRAPHS["claims"], PARAGRAPHS["glossary"], *claims]
+    words = "".join(f"- *{term}*: {text}\n" for term, text in tables.GLOSSARY.items())
+    parts += [PARAGRAPHS["claims"], words, *claims]
     return "\n".join(map(str, [*parts, *tables.notes_section(notes)]))
 
 
 def claims_sections(runs: Runs, tag: str | None) -> dict[tuple[str, str], Section]:
-    """(environment, family) of the paper's → its claims and the values behind them."""
+    """(environment, family) of the paper's that have runs → their claims and values."""
     found = {}
     for (env, family), claims in CLAIMS.items():
         methods = runs.methods(env, tag, family)
         if not methods:
-            found[env, family] = Section(_TITLES[env], ["No runs.\n"])
             continue
         variants = methods.values()
         rows = [_judged(text, claim, methods) for text, claim in claims.items()]
-        # Reasons are left aside.
-        verdicts = Counter(re.split(r" \(|:", row["verdict"])[0] for row in rows)
-        counted = ", ".join(f"{n} {verdict}" for verdict, n in verdicts.most_common())
-        parts = [f"{len(rows)} claims: {counted}.\n", TextTable(rows)]
+        counted = verdict_counts(rows).most_common()
+        listing = "; ".join(f"{n} {verdict}" for verdict, n in counted)
+        parts = [f"{len(rows)} claims: {listing}.\n", TextTable(rows)]
         if len({variant.tag for variant in variants}) > 1:
             parts.insert(0, f"{tags_shown(methods)}; the others are untagged.\n")
         seconds = duration(sum(variant.cpu_seconds for variant in variants))
         parts += [*_values(variants, family), f"CPU time of these runs: {seconds}.\n"]
         found[env, family] = Section(_TITLES[env], parts)
     return found
+
+
+def verdict_counts(rows: Iterable[Mapping[str, str]]) -> Counter[str]:
+    """How many of the claims' rows have which verdict, its reason left aside."""
+    return Counter(re.split(r" \(|:", row["verdict"])[0] for row in rows)
 
 
 def _judged(statement: str, claim: list[str], runs: Methods) -> dict[str, str]:
@@ -162,12 +171,11 @@ def _measured(quantity: str, variants: list[Variant]) -> tuple[float, Interval, 
 
 
 def verdict(value: float, interval: Interval, expect: str, seeds: int) -> str:
-    """`holds`, `does not hold` or `undecided`, with the reason for no verdict."""
+    """HOLDS, FAILS or `undecided`; with too few seeds only what the value points to."""
     if not np.isfinite(value):
         return "undecided (non-finite values)"
-    if seeds < FEWEST_SEEDS:
-        return f"undecided (fewer than {FEWEST_SEEDS} seeds)"
-    low, high = interval
+    few = seeds < FEWEST_SEEDS
+    low, high = (value, value) if few else interval
     holds, fails = {
         "= 0": (value == 0, value != 0),
         "> ½": (low > 0.5, high <= 0.5),
@@ -175,7 +183,9 @@ def verdict(value: float, interval: Interval, expect: str, seeds: int) -> str:
         "< 0": (high < 0, low >= 0),
         "≤ 0": (high <= 0, low > 0),
     }[expect]
-    return "holds" if holds else "does not hold" if fails else "undecided"
+    if few:
+        return EXPECTED if holds else UNEXPECTED
+    return HOLDS if holds else FAILS if fails else "undecided"
 
 
 def _values(variants: Iterable[Variant], family: str) -> list[str | TextTable]:

@@ -129,7 +129,8 @@ def report(
         if any(variant.family == family for variant in runs.variants):
             write(f"{stem}_{runs.scale}.csv", tables.aggregate(runs, family))
     claims, compared = claims_sections(runs, tag), tables.sweep_table(runs)
-    write(f"claims_{suffix}.md", claims_report(runs, tag, claims.values()))
+    if claims:
+        write(f"claims_{suffix}.md", claims_report(runs, tag, claims.values()))
     if sweeps := tables.sweep_sections(compared):
         ours = compared.groupby(["env", "method"]).groups
         notes = [note for note in runs.notes if (note.env, note.method) in ours]
@@ -188,9 +189,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BcrlError as error:
         say(f"bcrl-report: {error}")
         return 2
-    if options.scale != "search":
-        for line in skipped + not_shown:
-            say(f"skipped {line}")
+    for line in (skipped if "all" not in options.figures else []) + not_shown:
+        say(f"skipped {line}")
     show("\n".join(map(str, files + shown)))
     return 0
 

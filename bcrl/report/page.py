@@ -2,24 +2,35 @@
 
 import base64
 import hashlib
+import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
+from PIL import Image
 
 from bcrl import __version__
 from bcrl.common.identity import as_text, differences, flat, identity
 from bcrl.common.text import ABSENT, duration, number
+from bcrl.report.claims import EXPECTED, FAILS, HOLDS, UNEXPECTED, verdict_counts
 from bcrl.report.curve_data import curve_data
-from bcrl.report.tables import PARAGRAPHS, Section, TextTable
-from bcrl.report.variants import Pair, Runs, env_title, incomplete
+from bcrl.report.tables import GLOSSARY, PARAGRAPHS, TASKS, Section, TextTable
+from bcrl.report.variants import Pair, Runs, Variant, env_title, incomplete
 from bcrl.results.layout import seed_path, spelled
 
 Picture = tuple[Path, str]  # an image file and what it shows
+#: The page's cards of claims: title → verdict → its word after a number.
+_COUNTED = {
+    "claims": {HOLDS: "hold", FAILS: "do not hold", "undecided": "undecided"},
+    "claims, too few seeds to judge": {
+        EXPECTED: "as expected",
+        UNEXPECTED: "not as expected",
+    },
+}
 
 
 def page(
@@ -34,6 +45,7 @@ def page(
     browsers that run no scripts; `agents` move."""
     notes = runs.notes_on(tag)
     given = {"version": __version__, "texts": PARAGRAPHS, "runs": runs, "tag": tag}
+    given |= {"glossary": GLOSSARY, "about_tasks": TASKS}
     given |= {"figures": figures, "claims": claims, "agents": agents, "sweeps": sweeps}
     given |= {"notes": notes, "incomplete": incomplete(notes)}
     return _JINJA.get_template("page.html").render(
@@ -42,6 +54,7 @@ def page(
         costs=costs(runs),
         configs=configurations(runs),
         provenance=seed_origins(runs),
+        tasks={pair: task_values(runs.of(*pair)) for pair in runs.pairs},
         curves=[curve_data(runs, env, family, tag) for env, family in runs.pairs],
     )
 
@@ -50,18 +63,36 @@ def _facts(runs: Runs, claims: Mapping[Pair, Section]) -> dict[str, object]:
     """What the page's head says in numbers."""
     parts = [part for section in claims.values() for part in section.parts]
     rows = [row for part in parts if isinstance(part, TextTable) for row in part.rows]
-    verdicts = [row["verdict"] for row in rows if "verdict" in row]
+    counts = verdict_counts(row for row in rows if "verdict" in row)
     facts = {
         "environments": len({env for env, _ in runs.pairs}),
         "variants": len(runs.variants),
         "complete seeds": sum(len(v.seeds) for v in runs.variants),
         "CPU time": duration(sum(v.cpu_seconds for v in runs.variants)),
     }
-    if verdicts:
-        holds, fails = verdicts.count("holds"), verdicts.count("does not hold")
-        counted = f"{holds} · {fails} · {len(verdicts) - holds - fails}"
-        facts["claims that hold · do not · undecided"] = counted
+    for title, words in _COUNTED.items():
+        found = {word: counts.pop(verdict, 0) for verdict, word in words.items()}
+        if any(found.values()):
+            facts[title] = ", ".join(f"{n} {word}" for word, n in found.items() if n)
+    if counts:
+        facts["claims without data"] = counts.total()
     return facts
+
+
+def task_values(variants: Iterable[Variant]) -> dict[tuple[str, ...], str]:
+    """Each task's values as text → the variants that have these tasks."""
+    found: dict[tuple[str, ...], list[str]] = {}
+    for variant in variants:
+        varied = variant.config["env"].get("tasks") or {}
+        lists = {name: values for name, values in varied.items() if values is not None}
+        texts = []
+        for values in zip(*lists.values(), strict=True):
+            task = flat(dict(zip(lists, values, strict=True)))
+            # A simulator's attributes and arguments go by their own names.
+            each = (f"{k.rpartition('.')[2]} {as_text(v)}" for k, v in task.items())
+            texts.append(", ".join(each))
+        found.setdefault(tuple(texts), []).append(variant.name)
+    return {tasks: ", ".join(names) for tasks, names in found.items() if tasks}
 
 
 def costs(runs: Runs) -> list[str | TextTable]:
@@ -119,7 +150,7 @@ def seed_origins(runs: Runs) -> list[str | TextTable]:
         when = f"{dates[0]:%Y-%m-%d %H:%M} – {dates[-1]:%Y-%m-%d %H:%M} UTC"
         row = {"seeds": ", ".join(who), "revision": revision, "versions": versions}
         rows.append(row | {"machine": machine, "finished (files' dates)": when})
-    return [TextTable(rows)]
+    return [PARAGRAPHS["provenance"], TextTable(rows)]
 
 
 def _origin(sidecar: dict[str, Any]) -> tuple[str, ...]:
@@ -139,8 +170,18 @@ def _origin(sidecar: dict[str, Any]) -> tuple[str, ...]:
 
 def _url(image: Path) -> str:
     """The whole file as a URL."""
-    data = base64.b64encode(image.read_bytes()).decode()
-    return f"data:image/{image.suffix[1:]};base64,{data}"
+    return _data_url(image.read_bytes(), image.suffix[1:])
+
+
+def _still(animation: Path) -> str:
+    """The first frame as the URL of a PNG."""
+    with Image.open(animation) as image, io.BytesIO() as kept:
+        image.save(kept, "PNG")
+        return _data_url(kept.getvalue(), "png")
+
+
+def _data_url(image: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"
 
 
 def _prose(text: str) -> Markup:
@@ -148,6 +189,11 @@ def _prose(text: str) -> Markup:
     html = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", str(escape(text)))
     html = re.sub(r"\*(\w[^*]*?)\*", r"<em>\1</em>", html)
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", html))
+
+
+def _breakable(key: str) -> Markup:
+    """Escaped text whose dotted keys can go over several lines."""
+    return Markup(re.sub(r"([._])(?=\w)", r"\1<wbr>", str(escape(key))))
 
 
 def _sha256(text: str) -> str:
@@ -159,5 +205,5 @@ _BLOCKS = {"undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": T
 _JINJA = Environment(loader=PackageLoader("bcrl.report"), autoescape=True, **_BLOCKS)
 _STRICT = {"separators": (",", ":"), "allow_nan": False, "ensure_ascii": False}
 _JINJA.policies["json.dumps_kwargs"] = _STRICT
-_JINJA.filters |= {"prose": _prose, "url": _url, "sha256": _sha256}
-_JINJA.filters["env_title"] = env_title
+_JINJA.filters |= {"prose": _prose, "url": _url, "still": _still, "sha256": _sha256}
+_JINJA.filters |= {"breakable": _breakable, "env_title": env_title}

@@ -18,7 +18,10 @@ from bcrl.results.statistics import FEWEST_SEEDS, bootstrap, standard_error
 
 _PATH = Path(__file__).with_name("templates") / "texts.yaml"
 _TEXT = _PATH.read_text("utf-8").format(fewest=FEWEST_SEEDS, window=WINDOW)
-PARAGRAPHS = yaml.safe_load(_TEXT)  # paragraphs of the documents and the page, by name
+_DATA = yaml.safe_load(_TEXT)
+PARAGRAPHS: dict[str, str] = _DATA["paragraphs"]  # of the documents and the page
+GLOSSARY: dict[str, str] = _DATA["glossary"]  # by term
+TASKS: dict[str, str] = _DATA["tasks"]  # what differs between tasks, by environment
 
 
 class TextTable(NamedTuple):

@@ -5,7 +5,9 @@ import json
 import os
 import shutil
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
@@ -20,6 +22,7 @@ from tests.report.test_page import write_own
 NEEDED = "BCRL_BROWSER"  # set where a missing browser is an error, as in CI
 SWITCHES = "headless no-sandbox disable-gpu disable-quic no-first-run disable-sync "
 SWITCHES += "disable-background-networking disable-component-update"
+SVG = "{http://www.w3.org/2000/svg}"
 RETURN = "#runs-1 [data-metric=return]"  # the maze's
 pytestmark = pytest.mark.browser
 
@@ -52,6 +55,7 @@ class Page:
     def open(self) -> None:
         size = {"width": 1280, "height": 900, "deviceScaleFactor": 1, "mobile": False}
         self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        self.media("prefers-color-scheme", "light")
         self.driver.get("about:blank")
         self.events()
         self.driver.get(self.url)
@@ -65,6 +69,17 @@ class Page:
 
     def texts(self, selector: str) -> list[str]:
         return [element.text for element in self.all(selector)]
+
+    def media(self, feature: str, value: str, medium: str = "") -> None:
+        """What the page is shown on, and what the reader prefers."""
+        media = {"media": medium, "features": [{"name": feature, "value": value}]}
+        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+
+    def wait(self, until: Callable[[], bool]) -> None:
+        """Until something is so; TimeoutException after 20 seconds."""
+        from selenium.webdriver.support.wait import WebDriverWait
+
+        WebDriverWait(self.driver, 20, 0.05).until(lambda _: until())
 
     def press(self, selector: str, *keys: str) -> None:
         """Focus an element, then press keys."""
@@ -114,6 +129,10 @@ def runs_dir(tmp_path_factory) -> Path:
     for env in FQI_METRICS:
         write_fqi(root, env)
     write_own(root)
+    (root / "figures").mkdir()
+    frames = [Image.new("P", (100, 100), colour) for colour in (0, 1)]
+    animation = root / "figures/agent_maze_FQI_smoke.gif"
+    frames[0].save(animation, save_all=True, append_images=frames[1:], duration=99)
     assert report(root) == 0
     return root
 
@@ -142,7 +161,7 @@ def page(browser) -> Page:
 def test_the_page_is_drawn(page):
     assert page.texts("h1") == ["Boosted curriculum RL, scale smoke"]
     titles = page.texts("#runs-1 figcaption, #runs-2 figcaption, #runs-3 figcaption")
-    assert "error at the start, |Q − V*|" in titles
+    assert any(title.startswith("error at the start, |Q − V*|") for title in titles)
     assert "My <i>env, FQI" in page.texts("h2")  # names from files stay text
     assert page.all("h2 i, main script") == []
     for method in ("FQI", "C-FQI", "B-FQI", "BC-FQI"):
@@ -188,6 +207,126 @@ def test_seeds_median_and_zoom(page):
     assert "T5" in shown and "T1" not in shown
     page.press(f"{RETURN} svg", "\ue00c")  # Escape
     assert "T1" in page.texts(f"{RETURN} text")
+
+
+def test_values_are_announced(page):
+    """Chart and tables have roles and names; arrow keys and taps change a status."""
+    chart = page.find(f"{RETURN} svg")
+    assert chart.aria_role == "application" and "return" in chart.accessible_name
+    status = "#runs-1 [role=status]"
+    page.press(f"{RETURN} svg", "\ue011")  # Home
+    told = page.find(status).get_attribute("textContent")
+    assert told.startswith("iteration 1: FQI ") and "; BC-FQI " in told
+    page.press(f"{RETURN} svg", "\ue014")  # ArrowRight
+    assert "iteration 2: " in page.find(status).get_attribute("textContent")
+    tables = "#runs-1 .scroll table"
+    assert {table.aria_role for table in page.all(tables)} == {"table"}
+    assert len(page.all(f"{tables} caption")) == len(page.all(tables)) > 2
+    heads = page.all(f"{tables} tbody th")
+    assert {head.aria_role for head in heads} == {"rowheader"}
+
+
+def test_fingers(page):
+    """A tap shows values that stay until the next tap elsewhere; − undoes +."""
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.actions.pointer_input import PointerInput
+
+    def tap(selector: str) -> None:
+        page.script(
+            "arguments[0].scrollIntoView({block: 'center'})", page.find(selector)
+        )
+        finger = PointerInput("touch", "finger")
+        actions = ActionChains(page.driver, duration=0, devices=[finger])
+        pointer = actions.w3c_actions.pointer_action
+        pointer.move_to(page.find(selector)).pointer_down().pointer_up()
+        actions.perform()
+
+    tap(f"{RETURN} svg")
+    assert len(page.values(RETURN)) == 4
+    tap("#runs-1 [data-metric=q_error] svg")
+    assert len(page.values("#runs-1 [data-metric=q_error]")) == 4
+    assert page.all(f"{RETURN} .tip") == []
+    shown = page.texts(f"{RETURN} text")
+    tap("#runs-1 [aria-label='zoom in']")
+    assert page.texts(f"{RETURN} text") != shown
+    assert page.all(f"{RETURN} .tip") == []
+    tap("#runs-1 [aria-label='zoom out']")
+    assert page.texts(f"{RETURN} text") == shown
+
+
+def test_panels_are_downloaded(page, runs_dir, tmp_path):
+    """CSV with the aggregate's values, SVG and PNG in light colours with a legend."""
+    where = {"behavior": "allow", "downloadPath": str(tmp_path)}
+    page.driver.execute_cdp_cmd("Browser.setDownloadBehavior", where)
+    page.media("prefers-color-scheme", "dark")
+    page.find("#runs-1 .method:nth-of-type(2)").click()
+    saved = {}
+    for kind in ("CSV", "SVG", "PNG"):
+        path = tmp_path / f"maze-FQI-return.{kind.lower()}"
+        page.press(f"{RETURN} [aria-label$='as {kind}']", " ")
+        page.wait(path.exists)
+        saved[kind] = path
+    table = pd.read_csv(saved["CSV"])
+    assert set(table["variant"]) == {"FQI", "B-FQI", "BC-FQI"}  # those that are shown
+    aggregate = pd.read_csv(runs_dir / "figures/aggregate_smoke.csv")
+    keys = ["variant", "metric", "task", "iteration"]
+    both = table.merge(aggregate.query("env == 'maze'"), on=keys, validate="1:1")
+    assert len(both) == len(table) == 60
+    np.testing.assert_allclose(both["mean_x"], both["mean_y"], rtol=1e-6)
+    assert (table["interval_low"] <= table["interval_high"]).all()
+    drawing = ElementTree.parse(saved["SVG"])
+    texts = {text.text for text in drawing.iter(f"{SVG}text")}
+    assert texts >= {"discounted return", "optimum", "FQI", "B-FQI", "BC-FQI", "T10"}
+    colours = {path.get("stroke") for path in drawing.iter(f"{SVG}path")}
+    light = ImageColor.getrgb(style.colour("BC-FQI"))
+    assert f"rgb{light}" in colours
+    width, height = (float(drawing.getroot().get(k)) for k in ("width", "height"))
+    image = Image.open(saved["PNG"]).convert("RGB")
+    assert image.size == (int(width * 3), int(height * 3))
+    pixels = np.asarray(image)
+    assert (pixels[0, 0] == 255).all() and (pixels == light).all(-1).sum() > 500
+
+
+def test_nothing_is_wider_than_a_phone(page):
+    size = {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    page.driver.get(page.url)
+    wider = "return [...document.querySelectorAll('body *')].filter((e) => "
+    wider += "e.getBoundingClientRect().right > 400 && !e.closest('thead, .unseen'))"
+    assert page.script(wider) == []
+
+
+def test_all_of_it_is_printed(page):
+    """On A4 nothing is cut and nothing stays folded; panels are drawn anew for it."""
+    page.script("window.dispatchEvent(new Event('beforeprint'))")
+    width = "return document.querySelector('.panel svg').viewBox.baseVal.width"
+    assert page.script(width) == 340
+    page.script("window.dispatchEvent(new Event('afterprint'))")
+    assert page.script(width) > 340
+    folded = "return [...document.querySelectorAll('details pre')].filter("
+    folded += "(e) => !e.checkVisibility())"
+    assert page.script(folded)
+    size = {"width": 703, "height": 1016, "deviceScaleFactor": 1, "mobile": False}
+    page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    page.media("prefers-color-scheme", "dark", "print")
+    cut = "return [...document.querySelectorAll('main *')].filter((e) => "
+    cut += "e.scrollWidth > e.clientWidth + 1 && e.clientWidth || "
+    cut += "e.getBoundingClientRect().right > 704).map((e) => e.outerHTML)"
+    assert page.script(cut) == []
+    assert page.script(folded) == []
+    background = "return getComputedStyle(document.body).backgroundColor"
+    assert page.script(background) == "rgb(255, 255, 255)"
+
+
+def test_animations_stop(page):
+    """At once where motion is reduced, else by a button, which also plays them."""
+    moving = "return document.querySelector('.moving img').currentSrc.slice(5, 14)"
+    for value, kinds in (("reduce", ("png", "gif")), ("no-preference", ("gif", "png"))):
+        page.media("prefers-reduced-motion", value)
+        page.driver.get(page.url)
+        for kind in kinds:
+            page.wait(lambda kind=kind: page.script(moving) == f"image/{kind}")
+            page.press("#agents button", " ")
 
 
 def test_it_can_be_read_without_scripts(page):

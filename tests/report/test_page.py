@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import html
+import io
 import json
 import re
 from pathlib import Path
@@ -17,6 +18,7 @@ from bcrl.report.curve_data import curve_data
 from bcrl.report.figures.curves import POINTS, figure_curves, shared_spans, spread_rows
 from bcrl.report.figures.style import task_spans
 from bcrl.report.load import load_runs
+from bcrl.report.page import task_values
 from bcrl.results.layout import DQN_METRICS
 from tests.report.runs import report, write_dqn, write_fqi
 from tests.results.made_up import made_up_plan, write_seeds
@@ -151,6 +153,38 @@ def test_what_the_paper_does_not_compare_differs_in_more_than_its_colour(tmp_pat
     }
 
 
+def test_what_nobody_asked_for_is_not_missed(tmp_path, capsys):
+    """Tasks' values, one list for variants with the same; no claims, no lines about
+    figures of other environments."""
+    lists = {"attributes": [{"force": 0.2}, {"force": 0.1}], "kwargs": None}
+    for method, tasks in (("FQI", lists), ("B-FQI", lists), ("C-FQI", {"mass": [2]})):
+        config = {"env": MINE["env"] | {"tasks": tasks}}
+        plan = made_up_plan(tmp_path, "mine", method, range(1), config=config)
+        table = pd.DataFrame({"stage": [1], "task": 1, "iteration": [1]})
+        table[["return", "height"]] = 0.0
+        write_seeds(plan, lambda seed, table=table: table)
+    variants = load_runs(tmp_path, "smoke").of("mine", "FQI")
+    assert task_values(variants) == {
+        ("force 0.2", "force 0.1"): "FQI, B-FQI",
+        ("mass 2",): "C-FQI",
+    }
+    assert report(tmp_path) == 0
+    assert "figure" not in capsys.readouterr().err
+    assert not list(tmp_path.glob("figures/claims_*"))
+    page = page_of(tmp_path)
+    assert "<h3>Tasks of FQI, B-FQI</h3>" in page
+    assert "<dt>T2, target</dt><dd>force 0.1</dd>" in page
+    assert report(tmp_path, "--figures", "1") == 0
+    assert "skipped figure 1: no runs of car_on_hill" in capsys.readouterr().err
+
+
+def test_animations_have_a_still_picture(reported):
+    (still,) = re.findall(
+        r'reduce\)" srcset="data:image/png;base64,(.*?)"', page_of(reported)
+    )
+    assert Image.open(io.BytesIO(base64.b64decode(still))).size == (4, 4)
+
+
 def test_it_is_whole_and_names_no_other_place(reported):
     page = page_of(reported)
     assert set(re.findall(r"\w+://[\w./]+", page)) == {"http://www.w3.org/2000/svg"}
@@ -175,6 +209,7 @@ def test_the_page_has_all_parts(tmp_path):
     plan = made_up_plan(tmp_path, "maze", "FQI@seven", range(2), config=config)
     table = pd.read_csv(tmp_path / "smoke/maze/FQI/seed_0000.csv")
     write_seeds(plan, lambda seed: table)
+    write_fqi(tmp_path, "car_on_hill", seeds=3)
     for path in tmp_path.glob("smoke/maze/C-FQI/seed_0005.*"):
         path.unlink()
     assert report(tmp_path, "--allow-incomplete", "--figures", "2", "5") == 0
@@ -185,6 +220,12 @@ def test_the_page_has_all_parts(tmp_path):
     assert "algorithm.episodes: 5" in page
     assert "<mark>algorithm.episodes: 7</mark>   <i># FQI: 5</i>" in page
     assert "Variants compared" in page
-    assert '<td data-name="CPU time">22 s</td>' in page  # 6 × 3.6 s
+    assert ">22 s</td>" in page  # 6 × 3.6 s
+    facts = dict(re.findall(r"<div><dt>(claims.*?)</dt><dd>(.*?)</dd>", page))
+    assert facts.keys() == {"claims", "claims, too few seeds to judge"}
+    assert facts["claims"].split(", ")[0].endswith(" hold")
+    assert facts["claims, too few seeds to judge"] == "12 as expected"
+    assert page.count("<table") == page.count("<caption>") > 5
+    assert "<dt>residual, ϱ</dt>" in page
     assert re.search(r"maze BC-FQI 0–5", page)
     assert all(f"Figure {n}. Maze" in page for n in "25")

@@ -5,6 +5,7 @@
   const SVG = "http://www.w3.org/2000/svg";
   const MARGIN = { left: 52, right: 10, top: 18, bottom: 34 };
   const HEIGHT = 250;
+  const PRINTED = 340; // width of a panel on paper, two beside each other on A4
 
   const html = (name, attributes = {}, ...children) =>
     filled(document.createElement(name), attributes, children);
@@ -82,11 +83,20 @@
       };
       this.cursor = null;
       this.panels = html("div", { class: "panels" });
-      place.append(this.controls(), this.panels);
-      const hint = "Hover, or focus a panel and use the arrow keys, for values; drag, or + "
-        + "and −, to zoom; double-click or Esc shows all. Shift-click shows one method only.";
-      place.append(html("p", { class: "hint" }, hint));
+      this.live = html("p", { class: "unseen", role: "status" });
+      this.hint = `hint-${data.id}`;
+      const hint = "Hover, tap, or focus a panel and use the arrow keys, for values; drag, or "
+        + "+ and −, to zoom; double-click or Esc shows all. Shift-click shows one method only.";
+      const help = html("p", { class: "hint", id: this.hint }, hint);
+      place.append(this.controls(), this.panels, help, this.live);
       this.draw();
+      // On paper a panel has another width; a tap elsewhere takes the values away.
+      const printing = (on) => () => { this.printing = on; this.draw(); };
+      window.addEventListener("beforeprint", printing(true));
+      window.addEventListener("afterprint", printing(false));
+      document.addEventListener("pointerdown", (event) => {
+        if (!this.panels.contains(event.target)) this.leave();
+      });
       let width = this.panels.clientWidth;
       new ResizeObserver(() => {
         if (this.panels.clientWidth === width) return;
@@ -129,9 +139,12 @@
         made.prepend(svg("svg", { width: 22, height: 10, "aria-hidden": "true" }, stroke));
         return coloured(made, series);
       });
-      const metrics = data.metrics.map((metric) => this.button(
-        metric, () => state.metrics.has(metric), () => toggle(state.metrics, metric),
-      ));
+      const metrics = data.metrics.map((metric) => {
+        const act = () => toggle(state.metrics, metric);
+        const made = this.button(metric, () => state.metrics.has(metric), act);
+        made.title = data.labels[metric];
+        return made;
+      });
       const centre = (key, text) => this.button(
         text, () => state.centre === key, () => { state.centre = key; },
       );
@@ -142,10 +155,16 @@
         centre("mean", "mean"), centre("median", "median"),
         flag("spread", "interval"), flag("seeds", "single seeds"),
       ];
+      const zooms = [["+", "zoom in", 0.5], ["−", "zoom out", 2]].map(([sign, name, factor]) => {
+        const made = html("button", { type: "button", "aria-label": name, title: name }, sign);
+        made.addEventListener("click", () => this.scale(factor));
+        return made;
+      });
       if (data.courses) shown.push(flag("target", "target task only"));
       return html(
         "div", { class: "controls" },
         group("methods", "legend", ...methods), group("show", "", ...shown),
+        group("zoom", "", ...zooms),
         group("metrics", "", ...metrics),
       );
     }
@@ -176,6 +195,11 @@
       const focused = document.activeElement?.closest?.(".panel")?.dataset.metric;
       this.panels.replaceChildren(...shown.map((metric) => this.panel(metric)));
       this.views = shown.map((metric, i) => this.plot(metric, this.panels.children[i]));
+      this.views.forEach((view) => {
+        const now = () => this.views.find(({ metric }) => metric === view.metric);
+        const saving = downloads.buttons(now, this.data, { html, svg, coloured });
+        view.panel.firstChild.append(html("span", { class: "saving" }, ...saving));
+      });
       this.views.find((view) => view.metric === focused)?.svg.focus();
     }
 
@@ -185,7 +209,7 @@
     }
 
     plot(metric, panel) {
-      const width = Math.max(240, panel.clientWidth);
+      const width = this.printing ? PRINTED : Math.max(240, panel.clientWidth);
       const [x0, x1] = this.domain;
       const right = width - MARGIN.right, bottom = HEIGHT - MARGIN.bottom;
       const toX = (x) => MARGIN.left + ((x - x0) / (x1 - x0)) * (right - MARGIN.left);
@@ -195,7 +219,7 @@
           ? [found.low, found.high] : [found.q1, found.q3];
         const pick = (values) => places.map((i) => values[i]);
         return {
-          series, x: pick(series.x), task: pick(series.task),
+          series, places, x: pick(series.x), task: pick(series.task),
           y: pick(found[this.state.centre]), low: pick(low), high: pick(high),
           seeds: this.state.seeds ? found.seeds.map(pick) : [],
           far: found.far,
@@ -205,7 +229,8 @@
       const [y0, y1] = this.range(lines, optimum);
       const toY = (y) => bottom - ((y - y0) / (y1 - y0)) * (bottom - MARGIN.top);
       const root = svg("svg", {
-        viewBox: `0 0 ${width} ${HEIGHT}`, tabindex: 0, role: "img",
+        viewBox: `0 0 ${width} ${HEIGHT}`, tabindex: 0, role: "application",
+        "aria-roledescription": "chart", "aria-describedby": this.hint,
         "aria-label": `${this.data.labels[metric]} over ${this.data.axis}: ${lines.map((l) => l.series.name).join(", ")}`,
       });
       const clip = `clip-${this.data.id}-${metric}`;
@@ -232,8 +257,10 @@
       const inside = svg("g", { "clip-path": `url(#${clip})` });
       root.append(inside);
       if (optimum !== null) {
-        const d = `M${MARGIN.left} ${toY(optimum)}H${right}`;
-        inside.append(svg("path", { d, class: "optimum" }));
+        const y = toY(optimum), above = y > MARGIN.top + 15;
+        const at = { x: right - 3, y: above ? y - 4 : y + 12, "text-anchor": "end" };
+        const d = `M${MARGIN.left} ${y}H${right}`;
+        inside.append(svg("path", { d, class: "optimum" }), svg("text", at, "optimum"));
       }
       for (const each of lines) {
         const g = coloured(svg("g", { "data-method": each.series.name }), each.series);
@@ -248,7 +275,7 @@
         g.append(svg("path", { d, class: "centre", "stroke-dasharray": each.series.dash }));
         inside.append(g);
       }
-      const overlay = svg("g");
+      const overlay = svg("g", { class: "overlay" });
       root.append(overlay);
       panel.append(root);
       const xs = [...new Set(lines.flatMap((l) => l.x))]
@@ -315,7 +342,10 @@
       view.svg.addEventListener("pointermove", (event) => {
         this.point(view, dataX(event), from);
       });
-      view.svg.addEventListener("pointerleave", () => { if (from === null) this.leave(); });
+      view.svg.addEventListener("pointerleave", (event) => {
+        // A finger that is lifted leaves, too: its values stay.
+        if (from === null && event.pointerType !== "touch") this.leave();
+      });
       view.svg.addEventListener("pointerdown", (event) => {
         if (event.pointerType !== "mouse" || event.button) return;
         from = dataX(event);
@@ -328,30 +358,39 @@
         const ends = [start, dataX(event)].sort((a, b) => a - b);
         if (ends[1] - ends[0] > (x1 - x0) / 50) this.zoom(ends);
       });
+      view.svg.addEventListener("click", (event) => { // also a tap, after what it blurs
+        if (!this.views.includes(view)) return;
+        this.point(view, dataX(event));
+        this.say(view);
+      });
       view.svg.addEventListener("dblclick", () => this.zoom(null));
       view.svg.addEventListener("blur", () => this.leave());
       view.svg.addEventListener("keydown", (event) => {
         const { xs } = view;
         const now = xs.indexOf(this.cursor ?? NaN), end = xs.length - 1;
-        const around = this.cursor ?? (x0 + x1) / 2;
-        const part = (factor) => {
-          const [a, b] = [around - (around - x0) * factor, around + (x1 - around) * factor];
-          const full = this.state.zoom && factor > 1;
-          this.zoom(full && b - a >= this.full ? null : [a, b]);
-        };
+        const go = (x) => { this.point(view, x); this.say(view); };
         const act = {
-          ArrowLeft: () => this.point(view, xs[now < 0 ? end : Math.max(0, now - 1)]),
-          ArrowRight: () => this.point(view, xs[now < 0 ? 0 : Math.min(end, now + 1)]),
-          Home: () => this.point(view, xs[0]),
-          End: () => this.point(view, xs[end]),
-          "+": () => part(0.5),
-          "-": () => { if (this.state.zoom) part(2); },
+          ArrowLeft: () => go(xs[now < 0 ? end : Math.max(0, now - 1)]),
+          ArrowRight: () => go(xs[now < 0 ? 0 : Math.min(end, now + 1)]),
+          Home: () => go(xs[0]),
+          End: () => go(xs[end]),
+          "+": () => this.scale(0.5),
+          "-": () => this.scale(2),
           Escape: () => this.zoom(null),
         }[event.key];
         if (!act || !xs.length) return;
         event.preventDefault();
         act();
       });
+    }
+
+    /** Zoom by a factor around the values that were shown last. */
+    scale(factor) {
+      const [x0, x1] = this.domain, { last } = this;
+      if (factor > 1 && !this.state.zoom) return;
+      const around = last >= x0 && last <= x1 ? last : (x0 + x1) / 2;
+      const [a, b] = [around - (around - x0) * factor, around + (x1 - around) * factor];
+      this.zoom(factor > 1 && b - a >= this.full ? null : [a, b]);
     }
 
     zoom(ends) {
@@ -383,8 +422,7 @@
         (best, each, i) => (Math.abs(each - x) <= Math.abs(values[best] - x) ? i : best), 0,
       );
       const at = view.xs[near(view.xs)];
-      this.cursor = at;
-      x = at;
+      this.cursor = this.last = x = at;
       for (const each of this.views) {
         const d = `M${each.toX(at)} ${MARGIN.top}V${each.bottom}`;
         each.overlay.append(svg("path", { d, class: "cursor" }));
@@ -398,7 +436,17 @@
           each.overlay.append(coloured(svg("circle", centre), one.series));
         }
         if (each === view) this.tip(view, at, found);
+        each.found = found;
       }
+    }
+
+    /** Tell screen readers the values at the cursor. */
+    say(view) {
+      if (this.cursor === null) return;
+      const values = view.found.map(([one, i]) => `${one.series.name} ${number(one.y[i])}, `
+        + `from ${number(one.low[i], 4)} to ${number(one.high[i], 4)}, T${one.task[i]}`);
+      const at = `${this.data.counter} ${number(this.cursor, 9)}`;
+      this.live.textContent = `${at}: ${values.join("; ") || "no values"}`;
     }
 
     tip(view, at, found) {
@@ -412,7 +460,7 @@
         html("td", {}, html("small", {}, `T${one.task[i]}${
           one.x[i] === at ? "" : ` at ${number(one.x[i], 9)}`}`)),
       ));
-      const tip = html("div", { class: "tip", role: "status" }, head);
+      const tip = html("div", { class: "tip", "aria-hidden": "true" }, head);
       tip.append(html("table", {}, html("tbody", {}, ...rows)));
       view.panel.append(tip);
       const [outer, inner] = [view.panel, view.svg].map((e) => e.getBoundingClientRect());
@@ -429,5 +477,19 @@
   const data = JSON.parse(document.getElementById("curves-data").textContent);
   for (const place of document.querySelectorAll("[data-curves]")) {
     new Block(place, data[Number(place.dataset.curves)]);
+  }
+
+  // Animations can be stopped; the still picture is there for reduced motion, too.
+  for (const picture of document.querySelectorAll(".moving")) {
+    const source = picture.querySelector("source");
+    let moves = !window.matchMedia(source.media).matches;
+    const button = html("button", { type: "button" });
+    const show = () => {
+      source.media = moves ? "not all" : "all";
+      button.textContent = moves ? "stop" : "play";
+    };
+    button.addEventListener("click", () => { moves = !moves; show(); });
+    show();
+    picture.parentElement.querySelector("figcaption").append(" ", button);
   }
 })();
