@@ -12,6 +12,9 @@ from bcrl.results import layout
 from bcrl.run import costs, locks, memory, records
 from bcrl.run.schedule import Failures, merged, ordered
 
+#: What the words of a command line begin with that chooses no run.
+_NO_CHOICE = ("runs_dir=", "logger")
+
 
 def dry_run(plans: Sequence[Plan]) -> str:
     """The jobs that these plans would be now, and their expected costs."""
@@ -36,23 +39,31 @@ def dry_run(plans: Sequence[Plan]) -> str:
     return "\n".join([table, *hopeless, last])
 
 
-def status(arguments: Namespace) -> str:
-    """The states of a command line's seeds, or of all in its `runs_dir`, as a table."""
-    asked: list[tuple[Path, Sequence[int]]] = []
-    if all(override.startswith("runs_dir=") for override in arguments.overrides):
-        any_ = [*arguments.overrides, "env=maze"]  # it is a required choice
-        (plan,) = jobs.plans(Namespace(**vars(arguments) | {"overrides": any_}))
+def asked_folders(arguments: Namespace) -> list[tuple[Plan, Path, Sequence[int]]]:
+    """A command line's folders and seeds; without a choice of runs, all in `runs_dir`.
+
+    Each with its plan, or with one that has the command line's output keys only.
+    """
+    if not all(override.startswith(_NO_CHOICE) for override in arguments.overrides):
+        plans = merged(jobs.plans(arguments))
+        return [(plan, plan.directory, plan.seeds) for plan in plans]
+    any_ = [*arguments.overrides, "env=maze"]  # it is a required choice
+    found: list[tuple[Plan, Path, Sequence[int]]] = []
+    for plan in jobs.plans(Namespace(**vars(arguments) | {"overrides": any_})):
         for path in sorted(plan.root.glob(f"*/*/*/{layout.CONFIG}")):
             begun = layout.recorded_seeds(path.parent, "json")
             documents = [records.read_facts(path.parent, seed) for seed in begun]
             ever = set(begun).union(*(layout.requested(d) for d in documents if d))
-            asked.append((path.parent, sorted(ever)))
-        if not asked:
+            found.append((plan, path.parent, sorted(ever)))
+        if not found:
             raise BcrlError(f"runs_dir={plan.root}: holds no runs")
-    else:
-        asked += [(p.directory, p.seeds) for p in merged(jobs.plans(arguments))]
+    return found
+
+
+def status(arguments: Namespace) -> str:
+    """The states of a command line's seeds, or of all in its `runs_dir`, as a table."""
     rows, lines = dict[str, list[int]](), list[str]()
-    for directory, seeds in asked:
+    for _, directory, seeds in asked_folders(arguments):
         name = " ".join(directory.parts[-3:])
         found = {seed: records.state(directory, seed) for seed in seeds}
         lines += records.problems(name, found)
