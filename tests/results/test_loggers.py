@@ -14,7 +14,7 @@ import pytest
 
 from bcrl.common.signals import Interrupted
 from bcrl.errors import ConfigError
-from bcrl.results import loggers
+from bcrl.results import layout, loggers
 from bcrl.results.integrity import check_tree
 from bcrl.results.layout import LOGS, seed_path
 from bcrl.run import runner, sending
@@ -33,14 +33,19 @@ def marks(name: str) -> list:
 
 
 OTHERS = [pytest.param(name, marks=marks(name)) for name in ("wandb", "mlflow")]
+ALL = [pytest.param("tensorboard", marks=pytest.mark.slow), *OTHERS]
 Points = dict[str, list[tuple[int, float]]]
+
+
+def run_of(made, seed: int) -> loggers.Run:
+    return loggers.run_of(
+        made.directory, seed, layout.INDEX[made.family][-1], made.config
+    )
 
 
 def logged(made, seed: int, name: str) -> tuple[Points, dict]:
     """Each metric's (step, value), and what else a seed's log says, by its client."""
-    root = Path(made.config["runs_dir"])
-    run_name = f"{made.directory.relative_to(root).as_posix()}/seed_{seed:04d}"
-    return {"wandb": of_wandb, "mlflow": of_mlflow}[name](root, run_name)
+    return {"wandb": of_wandb, "mlflow": of_mlflow}[name](run_of(made, seed))
 
 
 def of_tensorboard(folder: Path) -> Points:
@@ -51,44 +56,60 @@ def of_tensorboard(folder: Path) -> Points:
     return {n: [(e.step, e.value) for e in events.Scalars(n)] for n in names}
 
 
-def of_wandb(root: Path, run_name: str) -> tuple[Points, dict]:
-    """By `wandb leet inspect`; there must be one offline run of this name."""
-    found = []
-    for folder in (root / ".wandb").glob("offline-run-*"):
-        command = [sys.executable, "-m", "wandb", "leet", "inspect", "--json", folder]
-        text = subprocess.run(command, capture_output=True, check=True, text=True)
-        records = [json.loads(line) for line in text.stdout.splitlines()]
-        (about,) = (each["run"] for each in records if each["type"] == "run")
-        if about["display_name"] == run_name:
-            found.append((records, about))
-    ((records, about),) = found
+def of_wandb(run: loggers.Run) -> tuple[Points, dict]:
+    """By `wandb leet inspect`."""
+    (folder,) = (run.runs_dir / ".wandb").glob(f"offline-run-*-{run.id}")
+    command = [sys.executable, "-m", "wandb", "leet", "inspect", "--json", folder]
+    text = subprocess.run(command, env=alone(), capture_output=True, check=True).stdout
+    records = [json.loads(line) for line in text.splitlines()]
+    (about,) = (each["run"] for each in records if each["type"] == "run")
+    assert about["display_name"] == run.name
     points: Points = {}
     for item in (each["history"]["item"] for each in records if "history" in each):
         row = {key: value for key, value in item.items() if key[0] != "_"}
-        count = row.pop("step" if "step" in row else "iteration")
+        count = row.pop(run.index)
         for key, value in row.items():
             points.setdefault(key, []).append((count, value))
     summaries = [each["summary"]["update"] for each in records if "summary" in each]
     ends = {key: value for each in summaries for key, value in each.items()}
     codes = [each["exit"].get("exit_code", 0) for each in records if "exit" in each]
-    about |= {"settings": about["config"]["update"], "facts": ends, "ended": codes}
-    return points, about | {"id": about["run_id"]}
+    settings = about["config"]["update"]
+    return points, {"settings": settings, "facts": ends, "ended": codes}
 
 
-def of_mlflow(root: Path, run_name: str) -> tuple[Points, dict]:
+def alone() -> dict[str, str]:
+    """The environment of a process without the network and this one's service."""
+    kept = {key: value for key, value in os.environ.items() if key != "WANDB_SERVICE"}
+    return kept | {"WANDB_ERROR_REPORTING": "false"}
+
+
+def of_mlflow(run: loggers.Run) -> tuple[Points, dict]:
     """By MlflowClient; there must be one run of this name."""
-    from mlflow import MlflowClient
-
-    client = MlflowClient(f"sqlite:///{root}/.mlflow/mlflow.db")
-    experiment = client.get_experiment_by_name("bcrl").experiment_id
-    (found,) = client.search_runs([experiment], f"run_name = '{run_name}'")
+    client, runs = runs_of_mlflow(run.runs_dir)
+    (found,) = (each for each in runs if each.info.run_name == run.name)
     points = {}
     for name in found.data.metrics:
         history = client.get_metric_history(found.info.run_id, name)
         points[name] = [(metric.step, metric.value) for metric in history]
     codes = {"FINISHED": [0], "FAILED": [1]}.get(found.info.status, [])
-    about = {"id": found.info.run_id, "settings": found.data.params, "ended": codes}
-    return points, about | {"facts": found.data.tags}
+    settings, facts = found.data.params, found.data.tags
+    return points, {"settings": settings, "facts": facts, "ended": codes}
+
+
+def runs_of_mlflow(root: Path):
+    from mlflow import MlflowClient
+
+    client = MlflowClient(f"sqlite:///{root}/.mlflow/mlflow.db")
+    experiment = client.get_experiment_by_name("bcrl")
+    return client, client.search_runs([experiment.experiment_id])
+
+
+def ids(root: Path, name: str) -> list[str]:
+    """The ids of all runs in a client's folder."""
+    if name == "mlflow":
+        return sorted(run.info.run_id for run in runs_of_mlflow(root)[1])
+    folders = (root / ".wandb").glob("offline-run-*")
+    return sorted(folder.name.rpartition("-")[2] for folder in folders)
 
 
 def expected(made, seed: int) -> Points:
@@ -114,9 +135,10 @@ def check(made, name: str) -> None:
             assert of_tensorboard(folder) == right
             continue
         points, log = logged(made, seed, name)
-        assert {k: sorted(v) for k, v in points.items()} == {
-            k: sorted(v) for k, v in right.items()
-        }
+        if name == "mlflow":  # it has equal values of two stages' one step once
+            right = {key: sorted(set(pairs)) for key, pairs in right.items()}
+            points = {key: sorted(pairs) for key, pairs in points.items()}
+        assert points == right
         assert log["ended"] == [0]
         assert str(log["settings"]["seed"]) == str(seed)
         assert log["settings"]["env.name"] == made.config["env"]["name"]
@@ -126,19 +148,28 @@ def check(made, name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["maze BC", "dqn BC"])
-@pytest.mark.parametrize("name", ["tensorboard", *OTHERS])
-def test_the_same_bytes_with_and_without(tmp_path, kind, name):
-    """One logged by two processes, one not: equal results, and a log of each seed."""
-    plain = run(tmp_path / "plain", *KINDS[kind])
+def test_dqn_s_bytes_are_the_same_with_and_without(tmp_path):
+    plain = run(tmp_path / "plain", *KINDS["dqn BC"])
+    log = run(tmp_path / "log", *KINDS["dqn BC"], "logger=tensorboard", "workers=2")
+    assert [results(plain, s) for s in (0, 1)] == [results(log, s) for s in (0, 1)]
+    check(log, "tensorboard")
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_same_bytes_with_and_without_and_seeds_sent_afterwards(tmp_path, name):
+    """Logged by two processes, or not at all, or after training, or both."""
+    plain = run(tmp_path / "plain", *MAZE)
     two = ("workers=2", "seeds.lockstep=1")
-    log = run(tmp_path / "log", *KINDS[kind], f"logger={name}", *two)
-    for seed in (0, 1):
-        assert results(plain, seed) == results(log, seed)
-    check(log, name)
+    log = run(tmp_path / "log", *MAZE, f"logger={name}", *two)
+    assert [results(plain, s) for s in (0, 1)] == [results(log, s) for s in (0, 1)]
     assert [path.name for path in (tmp_path / "plain").iterdir()] == ["smoke"]
+    check(log, name)
+    later = run(tmp_path / "log", *TABULAR)
+    sending.send(arguments(f"logger={name}", f"runs_dir={tmp_path / 'log'}"))
+    check(log, name)
+    check(later, name)
     variants, findings = check_tree(tmp_path / "log")
-    assert (len(variants), findings) == (1, [])
+    assert (len(variants), findings) == (2, [])
 
 
 def test_an_interrupted_run_logs_nothing_twice(tmp_path, monkeypatch):
@@ -158,7 +189,7 @@ def test_an_interrupted_run_logs_nothing_twice(tmp_path, monkeypatch):
 KILLED = """if True:
     import os, sys
     from bcrl.cli import main
-    from bcrl.results import loggers
+    from bcrl.results import layout, loggers
     from bcrl.results.loggers import mlflow
 
     def write(*row):
@@ -176,44 +207,36 @@ KILLED = """if True:
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_killed_run_goes_on_in_the_same_run_of_the_client(tmp_path, name):
     words = [*MAZE, f"logger={name}", f"runs_dir={tmp_path}", "checkpoint_every=0.001"]
-    killed = subprocess.run([sys.executable, "-c", KILLED, *words])
+    killed = subprocess.run([sys.executable, "-c", KILLED, *words], env=alone())
     assert killed.returncode == -signal.SIGKILL
-    p = plan(*words)
-    points, log = logged(p, 0, name)
-    assert len(points["return"]) in range(12, 16) and log["ended"] == []
+    p, begun = plan(*words), ids(tmp_path, name)
+    if name == "mlflow":  # wandb writes a file in larger blocks
+        points, log = logged(p, 0, name)
+        assert len(points["return"]) == 15 and log["ended"] == []
     runner.run(p)
-    assert logged(p, 0, name)[1]["id"] == log["id"]
+    assert ids(tmp_path, name) == begun and len(begun) == 2
     check(p, name)
-
-
-@pytest.mark.parametrize("name", OTHERS)
-def test_complete_seeds_are_sent_once_if_sent_twice(tmp_path, name):
-    made = run(tmp_path, *TABULAR)
-    words = (f"runs_dir={tmp_path}", f"logger={name}")
-    sending.send(arguments(*words))
-    sending.send(arguments(*TABULAR, *words))
-    check(made, name)
 
 
 @pytest.mark.parametrize("name", OTHERS[1:])
 def test_mlflow_gets_what_it_lacks_and_a_new_run_for_other_values(tmp_path, name):
     made = plan(*TABULAR, f"runs_dir={tmp_path}")
-    run_ = loggers.run_of(made.directory, 0, "iteration", made.config)
 
-    def write(length: int, value: float) -> None:
-        writer = loggers.MLflow("bcrl", None).open(run_)
-        for count in range(1, length + 1):
-            writer.write(count, {"return": value * count, "loss": np.nan})
+    def write(values: list[float]) -> None:
+        writer = loggers.MLflow("bcrl", None).open(run_of(made, 0))
+        for step, value in enumerate(values):
+            # A step that ends a stage and begins the next one has two rows.
+            writer.write(step // 2, {"return": value, "loss": np.nan})
         writer.close()
 
-    for length in (3, 5, 2):
-        write(length, 0.1)
+    values = [0.1, 0.7, 0.2, 0.6, 0.3, 0.5]
+    for length in (3, 6, 2):
+        write(values[:length])
     points, log = logged(made, 0, name)
-    assert points == {"return": [(count, 0.1 * count) for count in range(1, 6)]}
-    assert log["ended"] == []  # it was not finished
-    write(4, 0.2)
-    with pytest.raises(ValueError, match="too many values"):
-        logged(made, 0, name)  # there are two runs of this name
+    assert points == {"return": list(zip([0, 0, 1, 1, 2, 2], values, strict=True))}
+    assert log["ended"] == [] and len(ids(tmp_path, name)) == 1
+    write([0.1, 0.7, 0.9, 0.6, 0.3])
+    assert len(ids(tmp_path, name)) == 2
 
 
 NOTES: list[tuple] = []

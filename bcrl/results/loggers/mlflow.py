@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from filelock import FileLock
+
 from bcrl.common.identity import as_text
 from bcrl.results.layout import COMPLETE
 from bcrl.results.loggers.base import Logger, Row, Run, Writer, check_installed, finite
@@ -31,15 +33,18 @@ class MLflow(Logger):
         from mlflow.exceptions import MlflowException
 
         folder = run.runs_dir.resolve() / ".mlflow"
-        artifacts = None if self.tracking_uri else (folder / "artifacts").as_uri()
-        if not self.tracking_uri:
-            folder.mkdir(parents=True, exist_ok=True)
-        client = MlflowClient(self.tracking_uri or f"sqlite:///{folder}/mlflow.db")
-        try:
-            experiment = client.create_experiment(self.experiment, artifacts)
-        except MlflowException:  # it exists
-            found: Any = client.get_experiment_by_name(self.experiment)
-            experiment = found.experiment_id
+        folder.mkdir(parents=True, exist_ok=True)
+        address, artifacts = self.tracking_uri, None
+        if address is None:
+            address = f"sqlite:///{folder / 'mlflow.db'}"
+            artifacts = (folder / "artifacts").as_uri()
+        with FileLock(folder / "lock"):  # only one process can make its tables
+            client = MlflowClient(address)
+            try:
+                experiment = client.create_experiment(self.experiment, artifacts)
+            except MlflowException:  # it exists
+                found: Any = client.get_experiment_by_name(self.experiment)
+                experiment = found.experiment_id
         return _StoredRun(client, experiment, run)
 
 
@@ -79,13 +84,15 @@ class _StoredRun(Writer):
     def write(self, count: int, row: Row) -> None:
         self._rows += [(name, count, value) for name, value in finite(row).items()]
         if time.monotonic() - self._sent > SECONDS:
-            self._send(count)
+            self._send()
 
-    def _send(self, count: float) -> None:
-        """Send the rows that are missing, given that all below `count` are here."""
+    def _send(self, ended: bool = False) -> None:
+        """Send the rows that are missing; those of the last step may yet come."""
         from mlflow.entities import Metric
 
-        if any(step < count for _, step, _ in self._stored - set(self._rows)):
+        last = max((step for _, step, _ in self._rows), default=0)
+        others = self._stored - set(self._rows)
+        if any(step < last or ended for _, step, _ in others):
             self._begin()
         missing = [each for each in self._rows if each not in self._stored]
         now = int(time.time() * 1000)
@@ -96,11 +103,11 @@ class _StoredRun(Writer):
         self._sent = time.monotonic()
 
     def finish(self, facts: Mapping[str, Any]) -> None:
-        self._send(float("inf"))
+        self._send(ended=True)
         for key, value in facts.items():
             self._client.set_tag(self._id, key, as_text(value))
         self._status = "FINISHED" if facts["status"] == COMPLETE else "FAILED"
 
     def close(self) -> None:
-        self._send(0)
+        self._send()
         self._client.set_terminated(self._id, self._status)
