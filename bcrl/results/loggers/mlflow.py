@@ -9,6 +9,7 @@ from typing import Any
 from filelock import FileLock
 
 from bcrl.common.identity import as_text
+from bcrl.errors import BcrlError
 from bcrl.results.layout import COMPLETE
 from bcrl.results.loggers.base import Logger, Row, Run, Writer, check_installed, finite
 
@@ -36,6 +37,9 @@ class MLflow(Logger):
         folder.mkdir(parents=True, exist_ok=True)
         address, artifacts = self.tracking_uri, None
         if address is None:
+            if {"%", "?"} & {*str(folder)}:
+                why = "a path with % or ? has no MLflow address; name another"
+                raise BcrlError(f"runs_dir={run.runs_dir}: {why}")
             address = f"sqlite:///{folder / 'mlflow.db'}"
             artifacts = (folder / "artifacts").as_uri()
         with FileLock(folder / "lock"):  # only one process can make its tables
@@ -103,9 +107,11 @@ class _StoredRun(Writer):
         self._sent = time.monotonic()
 
     def finish(self, facts: Mapping[str, Any]) -> None:
+        from mlflow.entities import RunTag
+
         self._send(ended=True)
-        for key, value in facts.items():
-            self._client.set_tag(self._id, key, as_text(value))
+        tags = [RunTag(key, as_text(value)) for key, value in facts.items()]
+        self._client.log_batch(self._id, tags=tags)
         self._status = "FINISHED" if facts["status"] == COMPLETE else "FAILED"
 
     def close(self) -> None:
