@@ -73,7 +73,7 @@ def _checked(asked: Namespace) -> list:
     if asked.status:
         show(status.status(asked))
         return []
-    if asked.send:
+    if asked.send_complete:
         from bcrl.run import sending
 
         show(sending.send(asked))

@@ -22,7 +22,7 @@ def send(arguments: Namespace) -> str:
     for plan, folder, seeds in asked_folders(arguments):
         name = plan.config["logger"]["name"]
         if name == "none":
-            raise ConfigError("logger", name, "--send needs one, such as logger=mlflow")
+            raise ConfigError("logger", name, "name one to send to: logger=mlflow")
         made = loggers.logger(plan.config["logger"])
         states = {seed: records.state(folder, seed)[0] for seed in seeds}
         complete = [seed for seed in seeds if states[seed] == layout.COMPLETE]

@@ -80,7 +80,9 @@ def opened(
                 with suppress(Exception):
                     writer.close()
             writers.clear()
-            why = "training continues without its log; add --send when it is complete"
+            why = (
+                "training continues without its log; send it later with --send-complete"
+            )
             say(f"{folder}: the logger failed: {type(error).__name__}: {error}; {why}")
 
     def log(rows: Sequence[Sequence[Row]]) -> None:
