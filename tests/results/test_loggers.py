@@ -148,7 +148,7 @@ def check(made, name: str) -> None:
 
 
 @pytest.mark.slow
-def test_dqn_s_bytes_are_the_same_with_and_without(tmp_path):
+def test_bytes_of_dqn_are_the_same_with_and_without(tmp_path):
     plain = run(tmp_path / "plain", *KINDS["dqn BC"])
     log = run(tmp_path / "log", *KINDS["dqn BC"], "logger=tensorboard", "workers=2")
     assert [results(plain, s) for s in (0, 1)] == [results(log, s) for s in (0, 1)]
