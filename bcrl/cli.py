@@ -73,6 +73,11 @@ def _checked(asked: Namespace) -> list:
     if asked.status:
         show(status.status(asked))
         return []
+    if asked.send_complete:
+        from bcrl.run import sending
+
+        show(sending.send(asked))
+        return []
     plans = jobs.plans(asked)
     if asked.cfg or asked.info:
         _show_by_hydra(asked)

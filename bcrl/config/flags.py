@@ -24,6 +24,7 @@ from bcrl.errors import BcrlError, closest
 
 #: Flags of which Hydra knows nothing, or that are handed to it in another way.
 _OURS = {"describe", "dry_run", "status", "runs_dir", "overrides", "config_dir", "help"}
+_OURS |= {"send_complete"}
 
 
 def arguments() -> Namespace:
@@ -74,6 +75,7 @@ def flag_parser() -> argparse.ArgumentParser:
     result.add_argument("--describe", nargs="?", const="")
     result.add_argument("--dry-run", action="store_true")
     result.add_argument("--runs-dir")
+    result.add_argument("--send-complete", action="store_true")
     result.add_argument("--status", action="store_true")
 
     def reject(message: str) -> NoReturn:

@@ -24,7 +24,7 @@ from bcrl.learning.rollout import success_of
 from bcrl.learning.stage import CurriculumRun, RunState, SeedBatch, Snapshot
 from bcrl.q.functions import Q
 from bcrl.results import loggers
-from bcrl.results.layout import COMPLETE, RUNNING
+from bcrl.results.layout import COMPLETE, INDEX, RUNNING
 from bcrl.run import agent_files, checkpoints, extension, locks, records
 from bcrl.run.progress import Tick
 from bcrl.run.schedule import Job
@@ -52,16 +52,17 @@ def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
                 busy = any(set(batch) & set(seeds) for batch in begun)
             if not seeds or busy:
                 return {}
-            try:
-                job = replace(job, seeds=seeds, resumes=resumes)
-                with loggers.opened(plan.config, plan.directory, seeds) as log:
+            job = replace(job, seeds=seeds, resumes=resumes)
+            index = INDEX[plan.family][-1]
+            with loggers.opened(plan.config, plan.directory, seeds, index) as log:
+                try:
                     failed = _Training(job, held, log).train(tick, stop)
-            except Exception as error:
-                for seed in records.pending(plan, seeds):
-                    with suppress(BcrlError):  # the folder may be gone
-                        status = f"failed: {_reason(error)}"
-                        records.write_status(plan, seed, status, {})
-                raise
+                except Exception as error:
+                    for seed in records.pending(plan, seeds):
+                        with suppress(BcrlError):  # the folder may be gone
+                            status = f"failed: {_reason(error)}"
+                            records.write_status(plan, seed, status, {})
+                    raise
             checkpoints.remove_done(plan)
             return failed
     except Exception as error:
@@ -106,7 +107,7 @@ class _Training:
             self.residuals = stored["residuals"]
             self.rows, self.interruptions = json.loads(stored["rows"]), stored["stops"]
             self._began -= stored["spent"]
-            log(self.probe.index, self.rows)
+            log(self.rows)
 
     def train(self, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
         """Train to the end or until `stop`; the seeds that failed, and why."""
@@ -143,7 +144,7 @@ class _Training:
         new = [[where | metrics] for metrics in self.probe.measure(snapshot)]
         for place in self.failed:
             new[place] = []
-        self.log(index, new)
+        self.log(new)
         for rows, added in zip(self.rows, new, strict=True):
             rows += added
         for place, why in self.probe.failed.items():

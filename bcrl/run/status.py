@@ -13,6 +13,9 @@ from bcrl.results import layout
 from bcrl.run import costs, locks, memory, records
 from bcrl.run.schedule import Failures, merged, ordered
 
+#: What the words of a command line begin with that chooses no run.
+_NO_CHOICE = ("runs_dir=", "logger")
+
 
 def dry_run(plans: Sequence[Plan]) -> str:
     """The jobs that these plans would be now, and their expected costs."""
@@ -38,27 +41,38 @@ def dry_run(plans: Sequence[Plan]) -> str:
     return "\n".join([table, *settings, *hopeless, last])
 
 
-def status(arguments: Namespace) -> str:
-    """The states of a command line's seeds, or of all in its `runs_dir`, as a table."""
-    asked, settings = list[tuple[Path, Sequence[int]]](), dict[Path, Plain]()
-    if all(override.startswith("runs_dir=") for override in arguments.overrides):
-        any_ = [*arguments.overrides, "env=maze"]  # it is a required choice
-        words = Namespace(**vars(arguments) | {"overrides": any_})
-        (plan,) = jobs.plans(words)
+def asked_folders(arguments: Namespace) -> list[tuple[Plan, Path, Sequence[int]]]:
+    """A command line's folders and seeds; without a choice of runs, all in `runs_dir`.
+
+    Each with its plan, or with one that has the command line's output keys only.
+    """
+    if not all(override.startswith(_NO_CHOICE) for override in arguments.overrides):
+        plans = merged(jobs.plans(arguments))
+        return [(plan, plan.directory, plan.seeds) for plan in plans]
+    any_ = [*arguments.overrides, "env=maze"]  # it is a required choice
+    words = Namespace(**vars(arguments) | {"overrides": any_})
+    found: list[tuple[Plan, Path, Sequence[int]]] = []
+    for plan in jobs.plans(words):
         for path in sorted(plan.root.glob(f"*/*/*/{layout.CONFIG}")):
             begun = layout.recorded_seeds(path.parent, "json")
             documents = [records.read_facts(path.parent, seed) for seed in begun]
             ever = set(begun).union(*(layout.requested(d) for d in documents if d))
-            asked.append((path.parent, sorted(ever)))
-            settings[path.parent] = tags.settings_of(path.parent, words.folders)
-        if not asked:
+            found.append((plan, path.parent, sorted(ever)))
+        if not found:
             raise BcrlError(f"runs_dir={plan.root}: holds no runs")
-    else:
-        plans = merged(jobs.plans(arguments))
-        asked = [(plan.directory, plan.seeds) for plan in plans]
-        settings = {plan.directory: plan.settings for plan in plans}
-    rows, lines = dict[str, list[int]](), list[str]()
-    for directory, seeds in asked:
+    arguments.folders = words.folders
+    return found
+
+
+def status(arguments: Namespace) -> str:
+    """The states of a command line's seeds, or of all in its `runs_dir`, as a table."""
+    rows, lines, settings = dict[str, list[int]](), list[str](), dict[Path, Plain]()
+    for plan, directory, seeds in asked_folders(arguments):
+        there = directory == plan.directory
+        known = (
+            plan.settings if there else tags.settings_of(directory, arguments.folders)
+        )
+        settings[directory] = known
         name = " ".join(directory.parts[-3:])
         found = {seed: records.state(directory, seed) for seed in seeds}
         lines += records.problems(name, found)

@@ -56,16 +56,20 @@ def run(folder: Path, *overrides: str) -> Plan:
     return made
 
 
-def at_row(patch: pytest.MonkeyPatch, number: int, act: Callable[[], object]) -> None:
-    """Let `act` happen when a run has measured so many rows, of whatever seed."""
-    rows = []
+def at_row(
+    patch: pytest.MonkeyPatch, number: int, act: Callable[[], object]
+) -> list[int]:
+    """Let `act` happen when a run has measured so many rows; all counts so far."""
+    write, seen = loggers.write, list[int]()
 
-    def write(*row) -> None:
-        rows.append(row)
-        if len(rows) == number:
+    def counted(writer: loggers.Writer, index: str, row: loggers.Row) -> None:
+        write(writer, index, row)
+        seen.append(row[index])
+        if len(seen) == number:
             act()
 
-    patch.setattr(loggers.Writer, "write", write)
+    patch.setattr(loggers, "write", counted)
+    return seen
 
 
 def results(made: Plan, seed: int) -> tuple[bytes, bytes]:

@@ -12,9 +12,8 @@ import torch
 from bcrl import api
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.learning.stage import SeedBatch, learn
-from bcrl.results import loggers
 from bcrl.results.integrity import check_tree
-from bcrl.run import runner
+from bcrl.run import job, runner
 from bcrl.run.records import pending
 from tests.conftest import plan
 from tests.run.runs import KINDS, LINEAR, MAZE, TABULAR, about, results, rows, run
@@ -182,7 +181,7 @@ def test_a_failing_job_leaves_the_others_alone_and_is_reported(tmp_path, workers
 
 
 def test_an_unforeseen_error_shows_where_it_came_from(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(loggers.Writer, "write", lambda *_: 1 / 0)
+    monkeypatch.setattr(job.Probe, "measure", lambda *_: 1 / 0)
     with pytest.raises(runner.SeedsFailed, match="ZeroDivisionError: division by zero"):
         run(tmp_path, *TABULAR)
     assert "Traceback" in capsys.readouterr().err
