@@ -13,11 +13,11 @@ OUTPUT_KEYS += ("strict", "checkpoint_every", "logger")
 def identity(config: Plain) -> Plain:
     """The part of a config that decides numbers."""
     kept = {k: v for k, v in config.items() if k not in OUTPUT_KEYS}
-    sections = {k: dict(kept[k]) for k in ("env", "algorithm")}
-    sections["env"].pop("paper_seeds", None)
-    if "dataset_sha256" in sections["algorithm"]:  # logged data: where they lie is free
-        sections["algorithm"].pop("dataset", None)
-    return kept | sections
+    kept["env"] = {k: v for k, v in kept["env"].items() if k != "paper_seeds"}
+    algorithm = kept.get("algorithm", {})
+    if "dataset_sha256" in algorithm:  # logged data: where they lie changes nothing
+        kept["algorithm"] = {k: v for k, v in algorithm.items() if k != "dataset"}
+    return kept
 
 
 def differences(config: Plain, other: Plain) -> dict[str, tuple[Any, Any]]:

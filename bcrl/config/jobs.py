@@ -15,7 +15,7 @@ from bcrl.common.files import sha256
 from bcrl.common.identity import OUTPUT_KEYS, Plain, differences, flat
 from bcrl.config import hydra_compose, safety, schema
 from bcrl.config import plan as planning
-from bcrl.config.algorithms.fqi import fingerprint
+from bcrl.config.algorithms.fqi import logged_identity
 from bcrl.config.hints import Hints
 from bcrl.config.hydra_compose import CONF, CONFIG_NAME, Paths, composed, read_option
 from bcrl.config.overrides import canonical, parse, product
@@ -209,5 +209,5 @@ def _plain(job: DictConfig) -> Plain:
     for key, value in flat(config).items():  # tag=${env.gamma}
         if key in schema.TEXTS and not isinstance(value, str | None):
             raise ConfigError(key, value, "must be text: add some to the ${…}")
-    config["algorithm"] |= fingerprint(config["algorithm"])
+    config["algorithm"] |= logged_identity(config["algorithm"])
     return config

@@ -14,7 +14,7 @@ from bcrl.learning.bellman import residual_target, shaping
 from bcrl.learning.dataset import Dataset
 from bcrl.learning.stage import Pause, SeedBatch, Snapshot, Stage
 from bcrl.learning.transfer import StageInit, StageResult
-from bcrl.learning.transitions import Logged, opened
+from bcrl.learning.transitions import Logged, transitions_of
 from bcrl.q.functions import NOT_FINITE, ZERO, Q, Table, Values, query
 from bcrl.q.regressors.base import Cell, Fitted, FittedQ, Problem, Regressor, fit_each
 from bcrl.q.regressors.ours import ForestRegressor
@@ -143,7 +143,7 @@ class FQI:
         """The state before the first iteration, with a dataset for each seed."""
         env, previous, n = stage.env, start.previous, len(batch.seeds)
         if self.dataset is not None:
-            given = opened(self.dataset, stage.task, env)
+            given = transitions_of(self.dataset, stage.task, env)
             every = [dataset.of_logged(env, given, batch.probe)] * n
             return FQIState(0, every, None, {})
         if not self.new_data and previous is not None:

@@ -8,6 +8,8 @@ import hashlib
 import importlib
 import json
 import math
+import os
+import textwrap
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,7 +21,6 @@ from numpy.typing import NDArray
 from bcrl.common.files import write_atomically
 from bcrl.errors import ConfigError
 
-KEY = "algorithm.dataset"
 MINARI = "minari:"  # what the name of a Minari dataset begins with
 _NUMBERS, _INTEGERS = ("fiu", "finite numbers"), ("iu", "integers")
 #: The arrays: NumPy's kinds of their type, in words, and how many axes they have.
@@ -45,33 +46,36 @@ _NPY = {
 Arrays = dict[str, NDArray]
 
 
+def unusable(data: object, why: str) -> ConfigError:
+    """The error about logged data: a path, a name or transitions."""
+    return ConfigError("algorithm.dataset", data, why)
+
+
 def locate(name: str) -> Path:
     """The file or Minari folder that a path or `minari:ID` names."""
+    place, why = os.path.abspath(name), "is neither own nor shared, nor an existing "
+    why += "*.npz or *.parquet file, nor a Minari dataset (its folder, or minari:ID)"
     if name.startswith(MINARI):
-        _package("minari", name)
-        from minari.storage import get_dataset_path
-
-        path = get_dataset_path(name.removeprefix(MINARI))
-        why = f"there is no {path}; `minari download {path.name}` fetches a public one"
-    else:
-        path = Path(name).absolute()
-        why = "is neither own nor shared, nor an existing NPZ or Parquet file, nor a "
-        why += "Minari dataset (its folder, or minari:ID)"
-    folder = path / "data" if (path / "data").is_dir() else path
-    if folder.is_dir() and (folder / "metadata.json").is_file():
-        return folder
-    if not path.is_file():
-        raise ConfigError(KEY, name, why)
-    if path.suffix not in (".npz", ".parquet"):
-        raise ConfigError(KEY, name, "its name must end in .npz or .parquet")
-    return path
+        root = os.environ.get("MINARI_DATASETS_PATH", "~/.minari/datasets")
+        identifier = name.removeprefix(MINARI)
+        place = os.path.join(os.path.expanduser(root), identifier)
+        why = f"there is no {place}; `minari download {identifier}` gets a public one"
+    for folder in (place, os.path.join(place, "data")):
+        if os.path.isfile(os.path.join(folder, "metadata.json")):
+            return Path(folder)
+    if os.path.isfile(place) and place.endswith((".npz", ".parquet")):
+        return Path(place)
+    raise unusable(name, why)
 
 
-def sha256(path: Path) -> str:
+def content_sha256(path: Path) -> str:
     """The SHA-256 of a file, or of a folder's files and their names, hexadecimal."""
-    files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    stats = [(file, file.stat()) for file in files if file.is_file()]
-    return _sha256(path, tuple((f, s.st_size, s.st_mtime_ns) for f, s in stats))
+    try:
+        files = sorted(path.rglob("*")) if path.is_dir() else [path]
+        stats = [(file, file.stat()) for file in files if file.is_file()]
+        return _sha256(path, tuple((f, s.st_size, s.st_mtime_ns) for f, s in stats))
+    except OSError as error:
+        raise unusable(path, f"can't be read: {error.strerror}") from error
 
 
 @functools.lru_cache(maxsize=256)
@@ -87,7 +91,7 @@ def _sha256(path: Path, files: tuple[tuple[Path, int, int], ...]) -> str:
     return whole.hexdigest()
 
 
-def read(path: Path) -> Arrays:
+def load_arrays(path: Path) -> Arrays:
     """The arrays of a file that `locate` found; ConfigError if it can't be read."""
     try:
         if path.is_dir():
@@ -97,11 +101,14 @@ def read(path: Path) -> Arrays:
     except (ConfigError, MemoryError):
         raise
     except Exception as error:  # whatever a damaged file makes of its reader
-        why = f"can't be read as a whole {_kind(path)} ({_short(error)}); is it cut?"
-        raise ConfigError(KEY, path, why) from error
+        kinds = {".npz": "NPZ file", ".parquet": "Parquet file"}
+        kind, found = kinds.get(path.suffix, "Minari dataset"), type(error).__name__
+        found = textwrap.shorten(f"{found}: {error}", 200)
+        why = f"can't be read as a whole {kind} ({found}); is it cut?"
+        raise unusable(path, why) from error
 
 
-def write(path: Path, arrays: Mapping[str, Any]) -> Path:
+def save_arrays(path: Path, arrays: Mapping[str, Any]) -> Path:
     """Write arrays of the scheme as NPZ or Parquet, by the name's end, atomically."""
     if path.suffix == ".npz":
         return write_atomically(path, lambda file: np.savez(file, **arrays))
@@ -123,7 +130,8 @@ def write(path: Path, arrays: Mapping[str, Any]) -> Path:
 
 def _read_npz(path: Path, file: BinaryIO) -> Arrays:
     with zipfile.ZipFile(file) as archive:
-        members = [m for m in archive.infolist() if m.filename[:-4] in KNOWN]
+        every = archive.infolist()
+        members = [m for m in every if m.filename.removesuffix(".npy") in KNOWN]
         _check_size(path, sum(member.file_size for member in members))
         for member in members:
             with archive.open(member) as head:
@@ -162,10 +170,10 @@ def _values(path: Path, name: str, column: Any) -> NDArray:
         lengths = compute.unique(compute.list_value_length(column)).to_pylist()
         if len(lengths) > 1:
             why = f"{name} has lists of the lengths {lengths[:5]}, expected one length"
-            raise ConfigError(KEY, path, why)
+            raise unusable(path, why)
         flat = compute.list_flatten(column)
     if empty := flat.null_count + column.null_count * nested:
-        raise ConfigError(KEY, path, f"{name} has {empty} empty cells; fill them")
+        raise unusable(path, f"{name} has {empty} empty cells; fill them")
     return flat.to_numpy().reshape((n, len(flat) // max(1, n)) if nested else n)
 
 
@@ -180,8 +188,9 @@ def _read_minari(path: Path) -> Arrays:
     observed, acted = map(deserialize_space, each)
     flat = isinstance(observed, spaces.Box) and len(observed.shape) == 1
     if not flat or not isinstance(acted, spaces.Discrete):
-        why = "needs flat Box observations (d,) and Discrete actions; it has "
-        raise ConfigError(KEY, path, f"{why}{observed} and {acted}")
+        found = textwrap.shorten(f"{observed} and {acted}", 200)
+        why = f"has {found}, but needs flat Box observations (d,) and Discrete actions"
+        raise unusable(path, why)
     if about["data_format"] == "hdf5":
         h5py, sizes = _package("h5py", path), list[int]()
         with h5py.File(path / "main_data.hdf5") as file:
@@ -205,7 +214,7 @@ def _check_size(path: Path, needed: int) -> None:
     most = max(_RATIO * sum(file.stat().st_size for file in files), _SMALL)
     if needed > most:
         why = f"says that it has {needed} bytes of numbers, more than {_RATIO} times "
-        raise ConfigError(KEY, path, f"{why}its size; is it damaged?")
+        raise unusable(path, f"{why}its size; is it damaged?")
 
 
 def _package(name: str, wanted_by: object) -> Any:
@@ -215,13 +224,4 @@ def _package(name: str, wanted_by: object) -> Any:
     except ImportError as error:
         extra = "parquet" if name == "pyarrow" else "minari"
         why = f"needs {name}: pip install 'boosted-curriculum-rl[{extra}]'"
-        raise ConfigError(KEY, wanted_by, why) from error
-
-
-def _kind(path: Path) -> str:
-    kinds = {".npz": "NPZ file", ".parquet": "Parquet file"}
-    return kinds.get(path.suffix, "Minari dataset")
-
-
-def _short(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise unusable(wanted_by, why) from error

@@ -1,4 +1,4 @@
-"""Logged transitions: what fitted Q-iteration learns from instead of its own data."""
+"""Logged transitions, from which fitted Q-iteration learns without its own episodes."""
 
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bcrl.envs import Env, is_finite
 from bcrl.errors import ConfigError
 from bcrl.learning import logged_files
-from bcrl.learning.logged_files import KEY, NEEDED, SCHEME, TERMINATED
+from bcrl.learning.logged_files import NEEDED, SCHEME, TERMINATED, unusable
 from bcrl.learning.rollout import Episodes
 
 
@@ -64,7 +64,7 @@ class Transitions:
 
     def save(self, path: str | PathLike) -> Path:
         """Write a file that `dataset=` reads, *.npz or *.parquet."""
-        return logged_files.write(Path(path), self._arrays())
+        return logged_files.save_arrays(Path(path), self._arrays())
 
     def of_task(self, number: int) -> "Transitions":
         """The transitions of a task, numbered from 1; all without an array `task`."""
@@ -74,7 +74,7 @@ class Transitions:
         if not own.any():
             known = np.unique(self.task)[:20].tolist()
             why = f"has no transition of task {number}; its array `task` has {known}"
-            raise ConfigError(KEY, self, why)
+            raise unusable(self, why)
         return replace(self, **{k: v[own] for k, v in self._arrays().items()})
 
     def check(self, env: Env) -> None:
@@ -95,7 +95,7 @@ class Transitions:
                 if bad := (listed[rows] != states.astype(np.float32)).any(-1).sum():
                     why = f"{name} has {bad} rows that are no states of {env.name}"
         if why:
-            raise ConfigError(KEY, self, why)
+            raise unusable(self, why)
 
     def _arrays(self) -> dict[str, NDArray]:
         every = {field.name: getattr(self, field.name) for field in fields(self)}
@@ -112,53 +112,51 @@ class LoggedFile:
     name: str  # a path, or minari:ID
     sha256: str = ""  # "": any
 
+    def __str__(self) -> str:
+        return self.name
+
 
 Logged = Transitions | LoggedFile | str | PathLike
 
 
-def opened(dataset: Logged, task: int, env: Env) -> Transitions:
+def transitions_of(dataset: Logged, task: int, env: Env) -> Transitions:
     """The transitions of a stage's task; ConfigError if they do not suit `env`."""
     try:
-        found = read(dataset).of_task(task)
+        found = read_transitions(dataset).of_task(task)
         found.check(env)
     except ConfigError as error:
         if isinstance(error.value, Transitions):  # name the file, not its content
-            raise ConfigError(KEY, named(dataset), error.allowed) from error
+            raise unusable(dataset, error.allowed) from error
         raise
     return found
 
 
-def named(dataset: Logged) -> object:
-    """What a message calls a dataset."""
-    return dataset.name if isinstance(dataset, LoggedFile) else dataset
-
-
-def read(dataset: Logged) -> Transitions:
+def read_transitions(dataset: Logged) -> Transitions:
     """The transitions of a file, a folder of Minari's or `minari:ID`; as they are."""
     if isinstance(dataset, Transitions):
         return dataset
     if not isinstance(dataset, LoggedFile | str | PathLike):
-        raise ConfigError(KEY, dataset, "must be Transitions, a path or minari:ID")
+        raise unusable(dataset, "must be Transitions, a path or minari:ID")
     file = dataset if isinstance(dataset, LoggedFile) else LoggedFile(str(dataset))
     path = logged_files.locate(file.name)
-    content = logged_files.sha256(path)
+    content = logged_files.content_sha256(path)
     if file.sha256 not in ("", content):
         why = f"has the SHA-256 {content}, not {file.sha256}: it was changed"
-        raise ConfigError(KEY, file.name, f"{why}; run the command again")
+        raise unusable(file, f"{why}; run the command again")
     return _read(path, content)
 
 
 @lru_cache(maxsize=4)  # stages and jobs often share a file
 def _read(path: Path, _content: str) -> Transitions:
-    arrays = logged_files.read(path)
+    arrays = logged_files.load_arrays(path)
     if TERMINATED in arrays:
         if "absorbing" in arrays:
-            raise ConfigError(KEY, path, "has absorbing and terminated; keep one")
+            raise unusable(path, "has absorbing and terminated; keep one")
         arrays["absorbing"] = arrays.pop(TERMINATED)
     if lacking := [name for name in NEEDED if name not in arrays]:
         why = f"lacks {', '.join(lacking)}; it needs {', '.join(NEEDED)}"
-        raise ConfigError(KEY, path, why)
+        raise unusable(path, why)
     try:
         return Transitions(**arrays)
     except ConfigError as error:  # name the file, too
-        raise ConfigError(KEY, path, str(error)) from error
+        raise unusable(path, str(error)) from error

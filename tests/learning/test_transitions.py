@@ -11,8 +11,8 @@ from bcrl import api
 from bcrl.api import FQI, Boost, Shape, Transitions, warm_start
 from bcrl.common.seeding import stream
 from bcrl.errors import ConfigError
-from bcrl.learning import transitions
 from bcrl.learning.rollout import rollout, starts_and_draws
+from bcrl.learning.transitions import read_transitions
 from bcrl.q.functions import ZERO
 from tests.offline import needs
 from tests.toys import Corridor, OpenCorridor
@@ -90,7 +90,7 @@ def test_a_cut_episode_is_bootstrapped_and_an_absorbing_one_is_not():
 def test_a_file_brings_every_array_back(kind, tmp_path):
     task = np.arange(N) % 2 + 1
     data = Transitions(**ARRAYS | {"task": task})
-    found = transitions.read(data.save(tmp_path / f"data.{kind}"))
+    found = read_transitions(data.save(tmp_path / f"data.{kind}"))
     for name, values in vars(data).items():
         assert np.array_equal(getattr(found, name), values), name
         assert getattr(found, name).dtype == values.dtype
@@ -98,7 +98,7 @@ def test_a_file_brings_every_array_back(kind, tmp_path):
     named = vars(data) | {"terminated": data.absorbing, "source": np.ones(3)}
     del named["absorbing"]
     np.savez_compressed(tmp_path / "other.npz", **named)
-    again = transitions.read(tmp_path / "other.npz")
+    again = read_transitions(tmp_path / "other.npz")
     assert np.array_equal(again.absorbing, data.absorbing)
 
 
@@ -111,7 +111,7 @@ def test_a_table_of_pandas_with_a_list_per_row_is_read(tmp_path):
     }
     frame = pd.DataFrame(columns)
     frame.to_parquet(tmp_path / "data.parquet", row_group_size=20)
-    found = transitions.read(tmp_path / "data.parquet")
+    found = read_transitions(tmp_path / "data.parquet")
     assert np.array_equal(found.next_observation, ARRAYS["next_observation"])
     frame.loc[3, "reward"] = None
     frame.to_parquet(tmp_path / "gap.parquet")
@@ -119,7 +119,7 @@ def test_a_table_of_pandas_with_a_list_per_row_is_read(tmp_path):
     frame.to_parquet(tmp_path / "ragged.parquet")
     for name, word in (("gap", "reward has 1"), ("ragged", "observation has lists")):
         with pytest.raises(ConfigError, match=word):
-            transitions.read(tmp_path / f"{name}.parquet")
+            read_transitions(tmp_path / f"{name}.parquet")
 
 
 def test_one_file_with_the_array_task_serves_a_curriculum(tmp_path):
@@ -183,11 +183,11 @@ def test_a_cut_or_foreign_file_is_rejected_by_name(kind, tmp_path):
     for content in (whole[:-40], whole[: len(whole) // 2], b"", b"no such format" * 9):
         path.write_bytes(content)
         with pytest.raises(ConfigError, match=f"data.{kind}.*can't be read"):
-            transitions.read(path)
+            read_transitions(path)
     for name in ("none.npz", "sharde", "", "data", "data.csv"):
         (tmp_path / "data.csv").write_text("1")
         with pytest.raises(ConfigError):
-            transitions.read(tmp_path / name)
+            read_transitions(tmp_path / name)
 
 
 def test_a_header_cannot_claim_more_than_the_file_has(tmp_path):
@@ -198,7 +198,7 @@ def test_a_header_cannot_claim_more_than_the_file_has(tmp_path):
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("reward.npy", head.getvalue())
     with pytest.raises(ConfigError, match=r"reward\.npy"):
-        transitions.read(path)
+        read_transitions(path)
     np.savez_compressed(path, reward=np.zeros(2**23), action=ARRAYS["action"])  # 64 MiB
     with pytest.raises(ConfigError, match="bytes"):
-        transitions.read(path)
+        read_transitions(path)

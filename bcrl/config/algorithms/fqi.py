@@ -12,9 +12,9 @@ from bcrl.config.variant import Composition
 from bcrl.envs import Env, is_simulated
 from bcrl.errors import ConfigError
 from bcrl.learning.fqi import FQI
-from bcrl.learning.logged_files import locate, sha256
+from bcrl.learning.logged_files import content_sha256, locate
 from bcrl.learning.stage import Stage
-from bcrl.learning.transitions import LoggedFile, opened
+from bcrl.learning.transitions import LoggedFile, transitions_of
 from bcrl.q.regressors.ours import regressor_class
 
 FAMILY = "FQI"
@@ -54,7 +54,7 @@ def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
         env, data, episodes = chosen.tasks[task], None, own.episodes
         if own.dataset not in COLLECTED:
             data = LoggedFile(own.dataset, own.dataset_sha256)
-            rows = len(opened(data, task + 1, env).reward)
+            rows = len(transitions_of(data, task + 1, env).reward)
             episodes = math.ceil(rows / env.horizon)  # as many, for what they cost
         every = own.evaluate_every
         if every is None:
@@ -88,13 +88,13 @@ def interval(env: Env, iterations: int, episodes: int) -> int:
     return math.ceil(iterations / max(1, iterations * episodes // rows))
 
 
-def fingerprint(section: Plain) -> Plain:
+def logged_identity(section: Plain) -> Plain:
     """`dataset_sha256` of a section with logged data: the content, wherever it lies."""
     given: Any = section.get("dataset")
     names = given if isinstance(given, list) else [given]
-    if not all(isinstance(name, str) for name in names) or {*names} <= {*COLLECTED}:
+    if not all(isinstance(x, str) for x in names) or {*names} <= {*COLLECTED}:
         return {}
-    found = [name if name in COLLECTED else sha256(locate(name)) for name in names]
+    found = [x if x in COLLECTED else content_sha256(locate(x)) for x in names]
     here = found if isinstance(given, list) else found[0]
     if section.get("dataset_sha256", here) != here:
         why = f"{given} has {here}: it was changed; leave the key out to accept this"
