@@ -53,11 +53,11 @@ class FQI:
     epsilon: float = 1.0  # of the ε-greedy data collection with the previous Q
     new_data: bool = True  # False: learn from the previous stage's data again
     shared_data: bool = False  # [released] one dataset per task for all seeds
+    fixed_trees: bool = False  # [released] the same randomness in every fit of a seed
+    evaluate_every: int = 1  # iterations of the stage; its last is always evaluated
     #: Logged transitions of all seeds, or their file or Minari dataset; None: own data,
     #: collected as `episodes`, `epsilon`, `new_data` and `shared_data` say.
     dataset: Logged | None = None
-    fixed_trees: bool = False  # [released] the same randomness in every fit of a seed
-    evaluate_every: int = 1  # iterations of the stage; its last is always evaluated
 
     name: ClassVar[str] = "fqi"
 

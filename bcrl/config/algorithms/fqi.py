@@ -69,9 +69,9 @@ def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
                 epsilon=own.epsilon,
                 new_data=own.new_data == "stage",
                 shared_data=own.dataset == "shared",
-                dataset=data,
                 fixed_trees=own.fit_randomness == "fixed",
                 evaluate_every=every,
+                dataset=data,
             )
         )
     return course(chosen, learners)
