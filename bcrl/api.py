@@ -38,6 +38,7 @@ from bcrl.learning.fqi import FQI
 from bcrl.learning.lspi import LSPI
 from bcrl.learning.stage import Learner, Stage, Transfer
 from bcrl.learning.transfer import Boost, PolicyReuse, ResidualPolicy, Shape, warm_start
+from bcrl.learning.transitions import Transitions
 from bcrl.q.regressors.ours import ForestRegressor as Forest
 from bcrl.q.regressors.ours import Tabular
 from bcrl.q.regressors.scikit import Sklearn
@@ -54,6 +55,7 @@ __all__ = ["CarOnHill", "Gymnasium", "LinearSystem", "Maze", "compiled_step"]
 __all__ += ["export", "load", "plot", "read", "run", "stages"]
 __all__ += ["DQN", "FQI", "LSPI", "Forest", "Sklearn", "Tabular"]
 __all__ += ["Boost", "PolicyReuse", "ResidualPolicy", "Shape", "warm_start"]
+__all__ += ["Transitions"]
 
 
 def stages(

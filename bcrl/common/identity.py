@@ -14,10 +14,13 @@ ABSENT_KEY = "absent"  # stands for the value of a key that one of two configs l
 def identity(config: Plain) -> Plain:
     """The part of a config that decides numbers."""
     kept = {k: v for k, v in config.items() if k not in OUTPUT_KEYS}
-    env = {k: v for k, v in kept["env"].items() if k != "paper_seeds"}
+    kept["env"] = {k: v for k, v in kept["env"].items() if k != "paper_seeds"}
+    algorithm = kept.get("algorithm", {})
+    if "dataset_sha256" in algorithm:  # logged data: where they lie changes nothing
+        kept["algorithm"] = {k: v for k, v in algorithm.items() if k != "dataset"}
     # A run decides what starts from it by its config, wherever its folder is.
     start = {k: v for k, v in kept.pop("start", {}).items() if v and k != "from"}
-    return kept | {"env": env} | ({"start": start} if start else {})
+    return kept | ({"start": start} if start else {})
 
 
 def differences(config: Plain, other: Plain) -> dict[str, tuple[Any, Any]]:

@@ -17,6 +17,7 @@ from bcrl.learning.fqi import FQI
 from bcrl.learning.lspi import LSPI
 from bcrl.learning.stage import Learner, Stage
 from bcrl.learning.transfer import Boost, Shape, StageInit, warm_start
+from bcrl.learning.transitions import transitions_of
 from bcrl.q.functions import ZERO
 from bcrl.q.quadratic import FEATURES
 
@@ -92,6 +93,7 @@ def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
             raise ConfigError("algorithm.learners", learner, why)
         if isinstance(learner, FQI):
             _check_fqi(chosen, learner, chosen.slots[slot], start)
+            _check_logged(chosen, learners, slot)
         elif isinstance(learner, DQN):
             _check_dqn(chosen, learner, start)
         elif isinstance(learner, LSPI):
@@ -129,6 +131,17 @@ def _check_fqi(chosen: Composition, learner: FQI, env: Env, start: StageInit) ->
         why = "is for algorithm=dqn; FQI learns with transfer=shaping, or without one"
     if why:
         raise ConfigError(key, value, why)
+
+
+def _check_logged(chosen: Composition, learners: Sequence[Any], slot: int) -> None:
+    """Raise ConfigError for logged data that are not those of the slot's task."""
+    data, env, task = learners[slot].dataset, chosen.slots[slot], chosen.order[slot] + 1
+    if data is None or transitions_of(data, task, env).task is not None:
+        return
+    for other, learner in zip(chosen.slots, learners, strict=True):
+        if getattr(learner, "dataset", None) == data and other != env:
+            why = "has no array `task`, so it suits one task: name one dataset per slot"
+            raise ConfigError("algorithm.dataset", data, why)
 
 
 def _check_dqn(chosen: Composition, learner: DQN, start: StageInit) -> None:

@@ -20,6 +20,7 @@ from bcrl.common.identity import (
 )
 from bcrl.common.text import shorten
 from bcrl.config import hydra_compose, schema
+from bcrl.config.algorithms.fqi import logged_identity
 from bcrl.config.hydra_compose import CONF, Paths, catalog, composed, read_option
 from bcrl.config.schema import VARIANT_GROUPS
 from bcrl.errors import BcrlError, ConfigError
@@ -110,6 +111,7 @@ def plain_config(job: DictConfig) -> Plain:
     for key, value in flat(config).items():  # tag=${env.gamma}
         if key in schema.TEXTS and not isinstance(value, str | None):
             raise ConfigError(key, value, "must be text: add some to the ${…}")
+    config["algorithm"] |= logged_identity(config["algorithm"])
     return config
 
 

@@ -14,8 +14,10 @@ from bcrl.learning.bellman import residual_target, shaping
 from bcrl.learning.dataset import Dataset
 from bcrl.learning.stage import Pause, SeedBatch, Snapshot, Stage
 from bcrl.learning.transfer import StageInit, StageResult
+from bcrl.learning.transitions import Logged, transitions_of
 from bcrl.q.functions import NOT_FINITE, ZERO, Q, Table, Values, query
 from bcrl.q.regressors.base import Cell, Fitted, FittedQ, Problem, Regressor, fit_each
+from bcrl.q.regressors.ours import ForestRegressor
 
 
 @storable
@@ -46,13 +48,16 @@ class FQI:
     """
 
     iterations: int
-    episodes: int
-    regressor: Regressor
+    episodes: int = 1000
+    regressor: Regressor = ForestRegressor()  # noqa: RUF009 (it is frozen)
     epsilon: float = 1.0  # of the ε-greedy data collection with the previous Q
     new_data: bool = True  # False: learn from the previous stage's data again
     shared_data: bool = False  # [released] one dataset per task for all seeds
     fixed_trees: bool = False  # [released] the same randomness in every fit of a seed
     evaluate_every: int = 1  # iterations of the stage; its last is always evaluated
+    #: Logged transitions of all seeds, or their file or Minari dataset; None: own data,
+    #: collected as `episodes`, `epsilon`, `new_data` and `shared_data` say.
+    dataset: Logged | None = None
 
     name: ClassVar[str] = "fqi"
 
@@ -137,6 +142,10 @@ class FQI:
     def _collect(self, stage: Stage, start: StageInit, batch: SeedBatch) -> FQIState:
         """The state before the first iteration, with a dataset for each seed."""
         env, previous, n = stage.env, start.previous, len(batch.seeds)
+        if self.dataset is not None:
+            given = transitions_of(self.dataset, stage.task, env)
+            every = [dataset.of_logged(env, given, batch.probe)] * n
+            return FQIState(0, every, None, {})
         if not self.new_data and previous is not None:
             return FQIState(0, previous.data, None, {})
         rngs = [stream(seed, "data", stage.number) for seed in batch.seeds]

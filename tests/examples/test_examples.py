@@ -31,6 +31,7 @@ def shown(name: str, tmp_path: Path) -> pd.DataFrame:
 def test_all_examples_are_tested():
     names = {path.stem for path in EXAMPLES.glob("*.py")}
     own = {"own_env", "own_compiled_env", "own_curriculum", "own_regressor"}
+    own |= {"offline_data"}
     assert names == own | {"minimal_bc_fqi", "minimal_sbc_dqn"}
 
 
@@ -70,3 +71,9 @@ def test_any_regressor_of_scikit_learn_fits_residuals(tmp_path):
     table = shown("own_regressor", tmp_path)
     returns = table.loc[["RBF", "forest"], 3].astype(float)  # of the first task
     assert (returns.abs() <= 1.0).all()
+
+
+@pytest.mark.slow
+def test_logs_of_a_random_policy_teach_more_than_it_can(tmp_path):
+    returns = shown("offline_data", tmp_path)[1].astype(float)
+    assert (returns[["B-FQI", "BC-FQI"]] > 50.0).all()
