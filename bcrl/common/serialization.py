@@ -61,7 +61,9 @@ def _fields(cls: type) -> list[str]:
     return [f.name for f in dataclasses.fields(cls) if not is_derived(f)]
 
 
-def write(file: BinaryIO, about: dict, content: Any, given: Sequence[Any]) -> None:
+def write_content(
+    file: BinaryIO, about: dict, content: Any, given: Sequence[Any]
+) -> None:
     """Store `content` as an NPZ, with a JSON document `about` it.
 
     Objects of `given` are not stored but named by their place in it. An object that
@@ -77,8 +79,8 @@ def write(file: BinaryIO, about: dict, content: Any, given: Sequence[Any]) -> No
 
 
 def written(about: dict, content: Any, given: Sequence[Any]) -> bytes:
-    """What `write` writes."""
-    write(file := io.BytesIO(), about, content, given)
+    """What `write_content` writes."""
+    write_content(file := io.BytesIO(), about, content, given)
     return file.getvalue()
 
 
@@ -97,7 +99,7 @@ def read_about(path: Path) -> dict:
 
 
 def read_content(path: Path, given: Sequence[Any], device: str = "cpu") -> Any:
-    """The content that `write` stored, tensors on `device`; BcrlError if damaged."""
+    """What `write_content` stored, tensors on `device`; BcrlError if damaged."""
     with _opened(path) as stored:
         structure = json.loads(stored("structure").tobytes())
         return _Unpacker(stored("data"), given, device).unpack(structure)

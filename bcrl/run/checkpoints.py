@@ -27,7 +27,9 @@ def save_checkpoint(
 ) -> None:
     """Store the batch's `content`, which refers to the objects of `given`."""
     about, path = about_of(plan) | {"seeds": list(seeds)}, checkpoint_path(plan, seeds)
-    write_atomically(path, lambda to: serialization.write(to, about, content, given))
+    write_atomically(
+        path, lambda to: serialization.write_content(to, about, content, given)
+    )
 
 
 def checkpoint_path(plan: Plan, seeds: Sequence[int], kind: str = CHECKPOINT) -> Path:

@@ -36,7 +36,9 @@ def keep(plan: Plan, run: CurriculumRun, content: dict[str, Any]) -> None:
     path = checkpoints.checkpoint_path(plan, seeds, STATE)
     about = checkpoints.about_of(plan) | {"seeds": list(seeds)}
     given = run.given
-    write_atomically(path, lambda to: serialization.write(to, about, content, given))
+    write_atomically(
+        path, lambda to: serialization.write_content(to, about, content, given)
+    )
 
 
 def adopt(longer: Plan) -> None:

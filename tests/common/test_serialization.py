@@ -24,7 +24,7 @@ def there_and_back(tmp_path):
     def store(content, given=()):
         path = tmp_path / "packed.npz"
         with open(path, "wb") as file:
-            serialization.write(file, {"of": "a test"}, content, given)
+            serialization.write_content(file, {"of": "a test"}, content, given)
         assert serialization.read_about(path) == {"of": "a test"}
         assert path.stat().st_size < 10_000
         return serialization.read_content(path, given)

@@ -98,7 +98,7 @@ def test_lanes_from_a_checkpoint_continue_in_the_middle_of_an_episode(kind, tmp_
         state, _, over, _ = lanes.step(state, rng.integers(2, size=4), None)
         state = lanes.restart(over, rng.random((4, 1)), state)
     with open(tmp_path / "x.npz", "wb") as file:
-        serialization.write(file, {}, lanes, [task])
+        serialization.write_content(file, {}, lanes, [task])
     again = serialization.read_content(tmp_path / "x.npz", [task])
     for action in rng.integers(2, size=(5, 4)):
         found = [each.step(state, action, None) for each in (lanes, again)]

@@ -155,7 +155,7 @@ def test_an_agent_of_another_seed_is_not_taken_for_this_one(tmp_path):
     seed_path(made.directory, 0, "agent").write_bytes(other)
     hashes = about(made, 0)["sha256"] | {"agent": files.sha256(other)}
     resealed(seed_path(made.directory, 0, "json"), sha256=hashes)
-    with pytest.raises(BcrlError, match="not the one that its run has recorded"):
+    with pytest.raises(BcrlError, match="holds no agent of seed 0"):
         bcrl.load(made.directory)
 
 
