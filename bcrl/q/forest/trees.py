@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bcrl.common.compiling import compiled, kept
 from bcrl.q.forest.descent import enter, new_descent, planes, sort_node
+from bcrl.q.forest.groups import GROUP, SHUFFLE, sift
 from bcrl.q.forest.lanes import LANES, choose_all, load, new_sums, store
 from bcrl.q.forest.split import (
     NODE,
@@ -26,7 +27,7 @@ from bcrl.q.forest.split import (
 
 
 class Rows(NamedTuple):
-    """The buffers of n rows of d features; `room` is 3 n."""
+    """The buffers of n rows of d features; `room` is 3 n + GROUP."""
 
     keys: NDArray[np.int32]  # (width · room,): those of a row are neighbours
     words: NDArray[np.int64]  # the same memory: with width 2, a word is a row
@@ -48,7 +49,7 @@ def _width(d):
 def _new_rows(x, weighted):
     """Rows whose first plane holds x (n, d) float32; targets and weights are unset."""
     n, width = U(x.shape[0]), _width(x.shape[1])
-    room = U(3) * n
+    room = U(3) * n + U(GROUP)
     keys = np.empty(width * room, np.int32)
     origin = np.empty(room, np.uint32)
     for i in range(n):
@@ -72,6 +73,12 @@ def _move_rows(rows, n, width, depth, start, stop, feature, cut):
     keys, words, origin, target, weight = rows
     a, b = _plane(depth) * n, _plane(depth + 1) * n
     left, right = start, stop - U(1)
+    if SHUFFLE and width == U(2):
+        source, to = a + start, b + start
+        if weight.size > 0:
+            columns = words, origin, target, weight
+            return sift(columns, source, a + stop, to, feature, cut) - b
+        return sift((words, origin, target), source, a + stop, to, feature, cut) - b
     if width == U(2):
         shift = np.int64(32) * feature
         for i in range(start, stop):
