@@ -1,27 +1,22 @@
-"""Passes over a node's rows of two features, eight rows at a time, for AVX-512.
+"""Moving a node's rows of two features, eight rows at a time, with AVX-512.
 
-Most nodes are small, and a loop that the compiler makes fast for hundreds of rows takes
-ten of them one by one. Here a small node is one **group** of `GROUP` rows: lanes beyond
-its end are masked. All operations are on integers, so the trees are the same bit for
-bit. Rows are `words`, int64 with feature 0's key in the lower half. Groups are read and
-blended beyond a node's end, so arrays have room for `GROUP` rows more.
+The rows come in **groups** of `GROUP`, and lanes beyond the node's end are masked: most
+nodes are one group. Groups are read and stored beyond a node's end, so arrays have room
+for `GROUP` rows more.
 """
-
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils, codegen, config
+from numba.core import cgutils
 
+from bcrl.common.compiling import features
 from bcrl.q.forest.lanes import instructions
 from bcrl.q.forest.split import U, inlined
 
 GROUP = 8
-_FEATURES = config.CPU_FEATURES or codegen.get_host_cpu_features()  # type: ignore[attr-defined]
 #: Whether one instruction puts the lanes of a vector in any order, as `sift` needs.
-SHUFFLE = {"+avx2", "+avx512f", "+avx512vl"} <= set(_FEATURES.split(","))
+SHUFFLE = {"+avx2", "+avx512f", "+avx512vl"} <= features()
 
 I8, I32, I64 = (ir.IntType(bits) for bits in (8, 32, 64))
 WORDS, NUMBERS = ir.VectorType(I64, GROUP), ir.VectorType(I32, GROUP)
@@ -61,97 +56,10 @@ def _load(b: ir.IRBuilder, where: ir.Value) -> ir.Value:
     return b.load(where, align=where.type.pointee.element.width // 8)
 
 
-@contextmanager
-def _groups(b, start, stop) -> Iterator[tuple[ir.Value, ir.Value]]:
-    """A loop over the groups of `start:stop`: where each begins, and its rows' mask."""
-    with cgutils.for_range_slice(b, start, stop, I64(GROUP)) as (i, _):
-        yield i, b.icmp_unsigned("<", LANE, _splat(b, b.sub(stop, i)))
-
-
 def _limit(b: ir.IRBuilder, cut: ir.Value) -> ir.Value:
     """The greatest word whose upper key is at most `cut`, in every lane."""
     upper = b.shl(b.sext(cut, I64), I64(32))
     return _splat(b, b.or_(upper, I64(0xFFFFFFFF)))
-
-
-def _fold(b: ir.IRBuilder, vector: ir.Value, name: str) -> ir.Value:
-    """All lanes taken together by LLVM's reduction `name`."""
-    element = vector.type.element
-    full = f"llvm.vector.reduce.{name}.v{GROUP}i{element.width}"
-    return _call(b, full, element, vector)
-
-
-@instructions
-def extremes(typing, words, start, stop):
-    """Least and greatest key of feature 0, then of feature 1, in rows `start:stop`."""
-
-    def generate(context, b, signature, args):
-        words, start, stop = args
-        kind = signature.args[0]
-        first = b.load(b.gep(context.make_array(kind)(context, b, words).data, [start]))
-        filler, pairs = _splat(b, first), ir.VectorType(I32, 2 * GROUP)
-        keys = b.bitcast(filler, pairs)
-        best = [(sign, cgutils.alloca_once_value(b, keys)) for sign in "<>"]
-        with _groups(b, start, stop) as (i, alive):
-            group = b.select(alive, _load(b, _at(context, b, kind, words, i)), filler)
-            keys = b.bitcast(group, pairs)
-            for sign, kept in best:
-                old = b.load(kept)
-                b.store(b.select(b.icmp_signed(sign, keys, old), keys, old), kept)
-        ends = []
-        for feature in range(2):
-            every_other = NUMBERS(list(range(feature, 2 * GROUP, 2)))
-            for name, (_, kept) in zip(("smin", "smax"), best, strict=True):
-                keys = b.load(kept)
-                ends.append(_fold(b, b.shuffle_vector(keys, keys, every_other), name))
-        return context.make_tuple(b, signature.return_type, ends)
-
-    return types.UniTuple(types.int32, 4)(words, types.uint64, types.uint64), generate
-
-
-def _tally(weighted: bool) -> Callable:
-    """The code of `tally`, or of `tally_weighted`."""
-
-    def generate(context, b, signature, args):
-        words, target, *weight, start, stop, cut0, cut1 = args
-        arrays = [words, target, *weight]
-        zero = WORDS([0] * GROUP)
-        sides = [
-            (rise, _limit(b, cut), [cgutils.alloca_once_value(b, zero) for _ in "ws"])
-            for rise, cut in ((32, cut0), (0, cut1))
-        ]
-        with _groups(b, start, stop) as (i, alive):
-            group, y, *w = (
-                _load(b, _at(context, b, kind, array, i))
-                for kind, array in zip(signature.args, arrays, strict=False)
-            )
-            count = w[0] if weighted else WORDS([1] * GROUP)
-            parts = (count, b.mul(count, y) if weighted else y)
-            for rise, limit, sums in sides:
-                raised = b.shl(group, _splat(b, I64(rise)))
-                left = b.and_(b.icmp_signed("<=", raised, limit), alive)
-                for part, total in zip(parts, sums, strict=True):
-                    b.store(b.add(b.load(total), b.select(left, part, zero)), total)
-        ends = [_fold(b, b.load(total), "add") for *_, sums in sides for total in sums]
-        return context.make_tuple(b, signature.return_type, ends)
-
-    return generate
-
-
-_FOUR = types.UniTuple(types.int64, 4)
-_ENDS = (types.uint64, types.uint64, types.int32, types.int32)
-
-
-@instructions
-def tally(typing, words, target, start, stop, cut0, cut1):
-    """Number and target sum of rows `start:stop` up to cut 0 of feature 0; and 1, 1."""
-    return _FOUR(words, target, *_ENDS), _tally(False)
-
-
-@instructions
-def tally_weighted(typing, words, target, weight, start, stop, cut0, cut1):
-    """`tally` of rows that count `weight` times."""
-    return _FOUR(words, target, weight, *_ENDS), _tally(True)
 
 
 @instructions

@@ -9,12 +9,14 @@ from itertools import chain
 
 from llvmlite import ir
 from numba import njit, types
-from numba.core import cgutils, codegen, config
+from numba.core import cgutils
 from numba.extending import intrinsic
 
-_FEATURES = config.CPU_FEATURES or codegen.get_host_cpu_features()  # type: ignore[attr-defined]
-#: Rows of a tile and floats per vector. With more rows, addresses are kept on the stack,
-#: and their loads make the loop take up to 2.4 times as long in half of the processes.
+from bcrl.common.compiling import features
+
+_FEATURES = features()
+#: Rows of a tile and floats per vector. With eight rows, the loop reads addresses from
+#: the stack, and in some processes it then takes up to 2.4 times as long.
 ROWS, LANES = 4, 16 if "+avx512f" in _FEATURES else 8 if "+avx2" in _FEATURES else 4
 WIDTH = 2 * LANES  # columns of a tile
 I32, I64 = ir.IntType(32), ir.IntType(64)
