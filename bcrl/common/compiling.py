@@ -50,3 +50,12 @@ def check() -> None:
 
     if numba.config.DISABLE_JIT:
         raise BcrlError("NUMBA_DISABLE_JIT=1: unset it, bcrl's loops must be compiled")
+
+
+def features() -> set[str]:
+    """Features of the processor that numba compiles for, such as "+avx2"."""
+    from numba.core import codegen, config  # a large import
+
+    given = config.CPU_FEATURES  # type: ignore[attr-defined]
+    names = codegen.get_host_cpu_features() if given is None else given
+    return set(names.split(","))

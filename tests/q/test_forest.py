@@ -1,6 +1,11 @@
 """The forest engine against scikit-learn's distribution and against arithmetic."""
 
+import hashlib
+import os
+import subprocess
+import sys
 from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -214,6 +219,30 @@ def test_neither_threads_nor_other_forests_nor_keeping_change_a_forest():
         found = predict_forests(forests, [x[:few] for x in points])
         for got, one in zip(found, alone, strict=True):
             assert (got == one.fitted[:few]).all()
+
+
+def digest() -> str:
+    """Forests of two features, of many sizes, and their predictions, as a hash."""
+    found = hashlib.sha256()
+    for n in (*range(1, 40), 1000):
+        x, y = hill(n, n)
+        counts = np.random.default_rng(n).integers(1, 4, n) if n % 2 else None
+        queries, _ = hill(3 * n, n + 1)
+        (fit,) = fit_forests([Regression(x, y, seeds(2), counts, queries)], PAPER)
+        parts = fit.forest.nodes, fit.forest.values, fit.fitted, fit.queried
+        for part in (*parts, fit.forest.predict(np.tile(queries, (40, 1)))):
+            found.update(part.tobytes())
+    return found.hexdigest()
+
+
+@pytest.mark.slow
+def test_a_processor_without_vectors_gives_the_same_bytes(tmp_path):
+    code = "from tests.q.test_forest import digest; print(digest())"
+    plain = {"NUMBA_CPU_NAME": "generic", "NUMBA_CACHE_DIR": str(tmp_path)}
+    root = Path(__file__).parents[2]
+    given = {"env": os.environ | plain, "cwd": root, "text": True}
+    found = subprocess.check_output([sys.executable, "-c", code], **given)
+    assert found.strip() == digest()
 
 
 @pytest.mark.parametrize("scale", [1e-290, 1e-9, 1.0, 1e12, 1e300])

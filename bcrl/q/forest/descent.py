@@ -14,6 +14,7 @@ from numba.core.cgutils import get_or_insert_function
 from numpy.typing import NDArray
 
 from bcrl.common.compiling import compiled, kept
+from bcrl.q.forest.groups import GROUP, SHUFFLE, sift
 from bcrl.q.forest.lanes import instructions
 from bcrl.q.forest.split import LOW32, NODE, U, inlined, key_of, uncounted
 
@@ -29,13 +30,14 @@ class Descent(NamedTuple):
     """The rows (m, d) that go down, and memory for their way.
 
     A row is named by the place where its keys begin: a product less in each node. A
-    row's room is a power of two, and its number a shift away: a division less.
+    row's room is a power of two, and its number a shift away: a division less. Rows lie
+    in three planes, like those that a tree grows from.
     """
 
     keys: NDArray[np.int32]  # (m · 2^shift,), fewer than 2^32
     shift: np.uint64  # the least with d <= 2^shift
-    one: NDArray[np.uint32]  # (m,) each: the rows, sorted from one into the other
-    other: NDArray[np.uint32]  # and back
+    rows: NDArray[np.uint32]  # (3 m + GROUP,)
+    words: NDArray[np.int64]  # the same of the keys, if groups move; else empty
     stack: NDArray[np.int64]
 
 
@@ -48,36 +50,34 @@ def new_descent(x):
     for i in range(U(m)):
         for f in range(d):
             keys[(i << shift) + U(f)] = key_of(x[i, f])
-    one, other = np.empty(m, np.uint32), np.empty(m, np.uint32)
+    room, moved = 3 * m + GROUP, SHUFFLE and d == 2
+    rows, words = np.empty(room, np.uint32), np.empty(room if moved else 0, np.int64)
+    for i in range(U(m)):
+        rows[i] = np.uint32(i << shift)
+    if moved:
+        words[:m] = keys.view(np.int64)
     stack = np.empty((m + 1, 4), np.int64)  # memory that is not used is free
-    return Descent(keys, shift, one, other, stack)
+    return Descent(keys, shift, rows, words, stack)
 
 
 @inlined
-def planes(descent, depth):
-    """The plane that a node of this depth has its rows in, and its children's."""
-    if depth & 1:
-        return descent.other, descent.one
-    return descent.one, descent.other
+def plane(depth):
+    """The plane that a node of this depth lies in."""
+    return U(0) if depth == 0 else U(1 + (depth & 1))
 
 
 @inlined
-def enter(descent):
-    """Put all rows into the root."""
-    for i in range(descent.one.size):
-        descent.one[i] = np.uint32(U(i) << descent.shift)
-
-
-@inlined
-def sort_node(descent, depth, start, stop, feature, cut):
+def sort_node(descent, m, depth, start, stop, feature, cut):
     """Sort a node's rows into its children's plane; returns the left child's end."""
-    keys, column = descent.keys, U(feature)
-    here, there = planes(descent, depth)
+    keys, rows, words, column = descent.keys, descent.rows, descent.words, U(feature)
+    a, b = plane(depth) * m, plane(depth + 1) * m
+    if SHUFFLE and words.size > 0:
+        return sift((words, rows), a + start, a + stop, b + start, feature, cut) - b
     left, right = start, stop - U(1)
     for i in range(start, stop):
-        row = here[i]
+        row = rows[a + i]
         goes_left = U(keys[U(row) + column] <= cut)
-        there[left], there[right] = row, row  # the next row corrects one
+        rows[b + left], rows[b + right] = row, row  # the next row corrects one
         left += goes_left
         right -= U(1) - goes_left
     return left
@@ -87,22 +87,23 @@ def sort_node(descent, depth, start, stop, feature, cut):
 def _sort_down(nodes, values, root, descent, total):
     """Add one tree's predictions to `total`, sorting the rows down it."""
     stack, node, depth, top = descent.stack, root, 0, 0
-    keys, shift, start, stop = descent.keys, descent.shift, U(0), U(total.size)
-    enter(descent)
+    keys, shift, rows = descent.keys, descent.shift, descent.rows
+    m = U(total.size)
+    start, stop = U(0), m
     while True:
         child, feature, cut = nodes[node].child, nodes[node].feature, nodes[node].cut
-        here, _ = planes(descent, depth)
+        here = plane(depth) * m
         if feature < 0:
-            for i in range(start, stop):
-                total[U(here[i]) >> shift] += values[child]
+            for i in range(here + start, here + stop):
+                total[U(rows[i]) >> shift] += values[child]
         elif nodes[child].feature & nodes[child + 1].feature < 0:
             # Both children are leaves: no need to sort.
             leaf, column = U(nodes[child].child), U(feature)
-            for i in range(start, stop):
-                row = U(here[i])
+            for i in range(here + start, here + stop):
+                row = U(rows[i])
                 total[row >> shift] += values[leaf + U(keys[row + column] > cut)]
         else:
-            left = sort_node(descent, depth, start, stop, feature, cut)
+            left = sort_node(descent, m, depth, start, stop, feature, cut)
             depth += 1
             if left < stop:
                 stack[top, 0], stack[top, 1] = child + 1, depth

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.common.compiling import compiled, kept
-from bcrl.q.forest.descent import enter, new_descent, planes, sort_node
+from bcrl.q.forest.descent import new_descent, plane, sort_node
+from bcrl.q.forest.groups import GROUP, SHUFFLE, sift
 from bcrl.q.forest.lanes import LANES, choose_all, new_sums, store, vector_at
 from bcrl.q.forest.split import (
     NODE,
@@ -26,7 +27,7 @@ from bcrl.q.forest.split import (
 
 
 class Rows(NamedTuple):
-    """The buffers of n rows of d features; `room` is 3 n."""
+    """The buffers of n rows of d features; `room` is 3 n + GROUP."""
 
     keys: NDArray[np.int32]  # (width · room,): those of a row are neighbours
     words: NDArray[np.int64]  # the same memory: with width 2, a word is a row
@@ -48,7 +49,7 @@ def _width(d):
 def _new_rows(x, weighted):
     """Rows whose first plane holds x (n, d) float32; targets and weights are unset."""
     n, width = U(x.shape[0]), _width(x.shape[1])
-    room = U(3) * n
+    room = U(3) * n + U(GROUP)
     keys = np.empty(width * room, np.int32)
     origin = np.empty(room, np.uint32)
     for i in range(n):
@@ -61,17 +62,17 @@ def _new_rows(x, weighted):
 
 
 @inlined
-def _plane(depth):
-    """The plane that a node of this depth lies in."""
-    return U(0) if depth == 0 else U(1 + (depth & 1))
-
-
-@inlined
 def _move_rows(rows, n, width, depth, start, stop, feature, cut):
     """Move a node's rows to its children's plane; returns the left child's end."""
     keys, words, origin, target, weight = rows
-    a, b = _plane(depth) * n, _plane(depth + 1) * n
+    a, b = plane(depth) * n, plane(depth + 1) * n
     left, right = start, stop - U(1)
+    if SHUFFLE and width == U(2):
+        source, to = a + start, b + start
+        if weight.size > 0:
+            columns = words, origin, target, weight
+            return sift(columns, source, a + stop, to, feature, cut) - b
+        return sift((words, origin, target), source, a + stop, to, feature, cut) - b
     if width == U(2):
         shift = np.int64(32) * feature
         for i in range(start, stop):
@@ -122,9 +123,8 @@ def _grow_tree(
     n_nodes += 1
     n, m = U(fitted.size), U(queried.size)
     start, stop, q_start, q_stop = U(0), n, U(0), m
-    enter(queries)
     while True:
-        here = _plane(depth) * n
+        here = plane(depth) * n
         first, last = here + start, here + stop
         feature, cut, w_left, s_left = -1, np.int32(0), np.int64(0), np.int64(0)
         enough = node_weight >= min_split and node_weight >= 2 * min_leaf
@@ -164,9 +164,9 @@ def _grow_tree(
             value = node_total * unit / node_weight
             for i in range(first, last):
                 fitted[rows.origin[i]] += value
-            there, _ = planes(queries, depth)
-            for i in range(q_start, q_stop):
-                queried[U(there[i]) >> queries.shift] += value
+            there = plane(depth) * m
+            for i in range(there + q_start, there + q_stop):
+                queried[U(queries.rows[i]) >> queries.shift] += value
             if keep:
                 nodes[node].cut, nodes[node].feature = 0, -1
                 nodes[node].child = n_values
@@ -184,7 +184,7 @@ def _grow_tree(
         middle = _move_rows(rows, n, width, depth, start, stop, feature, cut)
         q_middle = q_start
         if q_start < q_stop:
-            q_middle = sort_node(queries, depth, q_start, q_stop, feature, cut)
+            q_middle = sort_node(queries, m, depth, q_start, q_stop, feature, cut)
         if keep:
             nodes[node].cut, nodes[node].feature = cut, feature
             nodes[node].child = n_nodes
