@@ -12,9 +12,9 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from bcrl.common.compiling import features
+from bcrl.common.compiling import cpu_features
 
-_FEATURES = features()
+_FEATURES = cpu_features()
 #: Rows of a tile and floats per vector. With eight rows, the loop reads addresses from
 #: the stack, and in some processes it then takes up to 2.4 times as long.
 ROWS, LANES = 4, 16 if "+avx512f" in _FEATURES else 8 if "+avx2" in _FEATURES else 4
