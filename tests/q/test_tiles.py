@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from bcrl.q.networks.tiles import SIDE, WIDTH, multiply, turn
+from bcrl.q.networks.tiles import SQUARE, WIDTH, multiply, turn
 
 
 @njit
@@ -56,14 +56,14 @@ def test_products_are_numpys(n_rows, columns, n_terms):
 
 @njit
 def turn_all(slopes, units, turned):
-    for row in range(0, len(slopes), SIDE):
-        for column in range(0, slopes.shape[1], SIDE):
+    for row in range(0, len(slopes), SQUARE):
+        for column in range(0, slopes.shape[1], SQUARE):
             turn(slopes, units, turned, row, column)
 
 
 def test_slopes_are_masked_and_transposed():
     rng = np.random.default_rng(0)
-    slopes = rng.standard_normal((3 * SIDE, 2 * SIDE)).astype(np.float32)
+    slopes = rng.standard_normal((3 * SQUARE, 2 * SQUARE)).astype(np.float32)
     units = rng.standard_normal(slopes.shape).astype(np.float32)
     wanted, turned = np.where(units > 0, slopes, 0), np.zeros_like(slopes.T.copy())
     turn_all(slopes, units, turned)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.common.compiling import kept
-from bcrl.q.networks.tiles import SIDE, WIDTH, multiply, turn
+from bcrl.q.networks.tiles import SQUARE, WIDTH, multiply, turn
 
 FADED = 1e-30  # moments up to this size become 0: denormal numbers are slow
 #: For Adam's division and square root. An infinite weight may turn into one that is not
@@ -42,9 +42,9 @@ class Room(NamedTuple):
 def space(sizes, n):
     layers, widest, wide = len(sizes), sizes.max(), n + WIDTH
     return Room(
-        np.zeros((layers, widest + SIDE, wide), np.float32),
-        np.zeros((layers, widest + SIDE, wide), np.float32),
-        np.zeros((n + SIDE, widest + WIDTH), np.float32),
+        np.zeros((layers, widest + SQUARE, wide), np.float32),
+        np.zeros((layers, widest + SQUARE, wide), np.float32),
+        np.zeros((n + SQUARE, widest + WIDTH), np.float32),
         np.empty((widest + 1) * widest + WIDTH, np.float32),
         np.zeros((layers, widest + 1), np.int64),
         np.zeros(layers, np.int64),
@@ -120,8 +120,8 @@ def step_of_adam(parameters, first, second, gradient, adam):
 @_compiled
 def _mask_and_turn(slopes, units, n_units, n, turned):
     """Zero the slopes where their units are off; also transpose them."""
-    for k in range(0, n_units, SIDE):
-        for b in range(0, n, SIDE):
+    for k in range(0, n_units, SQUARE):
+        for b in range(0, n, SQUARE):
             turn(slopes, units, turned, k, b)
 
 
