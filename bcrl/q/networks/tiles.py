@@ -98,7 +98,7 @@ def multiply(out, columns, rows, n_rows, terms, n_terms, a, across, along, right
 
 @intrinsic
 def turn(typing, slopes, units, turned, row, column):
-    """Zero SQUARE · SQUARE slopes where their units are off, and write them transposed."""
+    """Zero a square of slopes where their units are off, and write it transposed."""
 
     def generate(context, b, signature, args):
         *arrays, row, column = args
