@@ -1,5 +1,6 @@
 """Agents that runs leave: their Q and actions after loading, files that are refused."""
 
+import io
 import json
 import subprocess
 import sys
@@ -126,19 +127,24 @@ def resealed(path: Path, **entries) -> None:
     path.write_text(files.sealed(document))
 
 
+def replaced(made, seed, suffix, data: bytes) -> None:
+    """Put other bytes in the place of a seed's file, with their hash in its JSON."""
+    seed_path(made.directory, seed, suffix).write_bytes(data)
+    hashes = about(made, seed)["sha256"] | {suffix: files.sha256(data)}
+    resealed(seed_path(made.directory, seed, "json"), sha256=hashes)
+
+
 def test_files_that_are_not_what_a_run_wrote_are_refused(tmp_path):
     made = run(tmp_path, *MAZE)
     path = seed_path(made.directory, 0, "agent")
-    whole, json_path = path.read_bytes(), seed_path(made.directory, 0, "json")
+    whole = path.read_bytes()
     for broken in (whole[:-100], whole.replace(b"about", b"abouT"), b""):
         path.write_bytes(broken)
         with pytest.raises(BcrlError, match=r"seed_0000\.agent"):
             bcrl.load(made.directory)
     other = serialization.relabelled(seed_path(made.directory, 1, "agent"), {})
     for wrong in (b"PK\x03\x04", other, whole[:-100]):
-        path.write_bytes(wrong)
-        hashes = about(made, 0)["sha256"] | {"agent": files.sha256(wrong)}
-        resealed(json_path, sha256=hashes)
+        replaced(made, 0, "agent", wrong)
         with pytest.raises(BcrlError, match=r"seed_0000\.agent"):
             bcrl.load(made.directory)
     path.unlink()
@@ -149,12 +155,27 @@ def test_files_that_are_not_what_a_run_wrote_are_refused(tmp_path):
         bcrl.load(tmp_path / "nothing")
 
 
+def test_compressed_arrays_are_refused_because_they_can_be_of_any_size(tmp_path):
+    made = run(tmp_path, *MAZE)
+    with np.load(seed_path(made.directory, 0, "npz")) as stored:
+        np.savez_compressed(packed := io.BytesIO(), **stored)
+    replaced(made, 0, "npz", packed.getvalue())
+    with pytest.raises(BcrlError, match=r"seed_0000\.npz"):
+        bcrl.load(made.directory)
+
+
+def test_a_run_is_found_by_any_path_to_it(tmp_path):
+    made = run(tmp_path, *MAZE)
+    (linked := tmp_path / "link" / "smoke" / "maze").mkdir(parents=True)
+    (linked / "BC-FQI").symlink_to(made.directory)
+    for path in (made.directory / ".." / "BC-FQI", linked / "BC-FQI"):
+        assert bcrl.load(path, 1).seed == 1
+
+
 def test_an_agent_of_another_seed_is_not_taken_for_this_one(tmp_path):
     made = run(tmp_path, *MAZE)
     other = seed_path(made.directory, 1, "agent").read_bytes()
-    seed_path(made.directory, 0, "agent").write_bytes(other)
-    hashes = about(made, 0)["sha256"] | {"agent": files.sha256(other)}
-    resealed(seed_path(made.directory, 0, "json"), sha256=hashes)
+    replaced(made, 0, "agent", other)
     with pytest.raises(BcrlError, match="holds no agent of seed 0"):
         bcrl.load(made.directory)
 
