@@ -61,11 +61,10 @@ def _compare(agent: Agent, npz: Path, document: dict[str, Any]) -> None:
     """Compare an agent's Q with the one that its run has recorded."""
     read_recorded(npz, document)
     states, recorded = read_arrays(npz, "states", "q")
-    own = agent.values(agent.learned.result.q, states)
-    if own.shape == recorded.shape and recorded.dtype.kind == "f":
-        own = own.astype(recorded.dtype)
-        if np.array_equal(own, recorded, equal_nan=True):
-            return
+    own = agent.values(agent.learned.result.q, states).astype(recorded.dtype)
+    if np.array_equal(own, recorded, equal_nan=True):
+        return
+    if own.shape == recorded.shape:
         difference = float(np.abs(own - recorded).max() / (1 + np.abs(recorded).max()))
         if difference < _NEAR:
             what = f"differs from the recorded one by {difference:.1g} of its size"

@@ -4,6 +4,7 @@ import io
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,13 @@ from bcrl.common import files, serialization
 from bcrl.common.seeding import stream
 from bcrl.envs import is_finite
 from bcrl.errors import BcrlError
+from bcrl.learning.learned import Learned, given
 from bcrl.learning.rollout import CHOICES, play, starts_and_draws
+from bcrl.learning.transfer import StageResult
+from bcrl.q.functions import Sum
+from bcrl.q.regressors.base import Fitted
 from bcrl.results.layout import seed_path
-from bcrl.run import evaluate, job
+from bcrl.run import agent_files, evaluate, job
 from tests.run.runs import KINDS, MAZE, about, rows, run
 
 FAST = ("maze BC", "maze C", "car_on_hill BC", "dqn SBC_released", "dqn RPL")
@@ -162,6 +167,29 @@ def test_compressed_arrays_are_refused_because_they_can_be_of_any_size(tmp_path)
     replaced(made, 0, "npz", packed.getvalue())
     with pytest.raises(BcrlError, match=r"seed_0000\.npz"):
         bcrl.load(made.directory)
+
+
+def test_models_that_would_not_fit_are_refused_before_they_are_made(
+    tmp_path, monkeypatch
+):
+    made = run(tmp_path, *KINDS["car_on_hill plain"])
+    path, regressor = (
+        seed_path(made.directory, 0, "agent"),
+        made.stages[-1].learner.regressor,
+    )
+    limit = 10 * (size := path.stat().st_size) * regressor.trees
+    monkeypatch.setattr(agent_files, "available", lambda: limit)
+    q = replace(bcrl.load(made.directory).learned.result.q, regressor=regressor)
+    (row,) = q.models
+    copies = [replace(q, models=[[Fitted(row[0].problem)] * 2]) for _ in range(200)]
+    wider = replace(q, models=[[*row, *row]])
+    for forged, why in ((Sum(tuple(copies)), "of memory"), (wider, "per action")):
+        content = Learned(StageResult(forged, forged), ())
+        about, same = serialization.read_about(path), given(made.stages, q.team)
+        replaced(made, 0, "agent", serialization.written(about, content, same))
+        assert path.stat().st_size < 2 * size
+        with pytest.raises(BcrlError, match=why):
+            bcrl.load(made.directory)
 
 
 def test_a_run_is_found_by_any_path_to_it(tmp_path):
