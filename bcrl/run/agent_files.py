@@ -78,7 +78,7 @@ def _check_models(path: Path, own: Learned, made: Plan) -> None:
     for part in serialization.parts(own):
         if isinstance(part, FittedQ) and [len(x) for x in part.models] != [n_actions]:
             raise BcrlError(f"{path} has not one model per action; remove it")
-        if isinstance(part, Fitted):  # each has trees of its own
+        if isinstance(part, Fitted):  # each gets its own trees
             of = part.problem
             size += of.x.nbytes + of.y.nbytes + of.multiplicity.nbytes
     regressors = (

@@ -232,6 +232,7 @@ def test_episodes_are_evaluated_in_a_task_of_choice(tmp_path, capsys):
     assert evaluate.main([*words, "env.mass=0.8", *out]) == 0
     assert evaluate.main([*words, "--task", "1", "--out", str(path)]) == 0
     assert (tmp_path / "other.csv").read_text() == path.read_text() != first
-    for wrong in (["env.mas=1"], ["mass=1"], ["--task", "4"], ["--episodes", "0"]):
+    wrongs = ["env.mas=1"], ["mass=1"], ["--task", "4"], ["--episodes", "0"]
+    for wrong in (*wrongs, ["env.mass=[1"], ["env.mass='1"], ["env.mass.x=1"]):
         assert evaluate.main([str(made.directory), *wrong]) == 2
     assert evaluate.main([str(tmp_path)]) == 2
