@@ -247,6 +247,11 @@ def test_what_cannot_be_drawn_is_explained():
         api.plot(frame[:0])
     with pytest.raises(BcrlError, match="seed"):
         api.plot(frame.drop(columns="seed"))
+    with pytest.raises(BcrlError, match="metric=note"):
+        api.plot(frame.assign(note="a"), "note")
+    lists = frame.assign(**{"learner.layers": [[8, 8]] * len(frame)})
+    with pytest.raises(BcrlError, match=r"learner\.layers"):
+        api.plot(lists)
     assert set(DQN_METRICS) <= set(steps)
 
 

@@ -61,6 +61,20 @@ def _fields(cls: type) -> list[str]:
     return [f.name for f in dataclasses.fields(cls) if not is_derived(f)]
 
 
+def parts(content: Any) -> Iterator[Any]:
+    """The storable objects that a storable object, list or tuple has, each once."""
+    seen, rest = {}, [content]
+    while rest:
+        if id(thing := rest.pop()) in seen:
+            continue
+        seen[id(thing)] = thing
+        if isinstance(thing, (list, tuple)):
+            rest += thing
+        elif is_storable(type(thing)):
+            yield thing
+            rest += [getattr(thing, name) for name in _fields(type(thing))]
+
+
 def write_content(
     file: BinaryIO, about: dict, content: Any, given: Sequence[Any]
 ) -> None:
@@ -173,6 +187,7 @@ class _Packer:
 class _Unpacker:
     def __init__(self, data: NDArray, given: Sequence[Any], device: str) -> None:
         self.data, self.device, self.made = data, device, list(given)
+        self._end = 0  # of the previous array
 
     def unpack(self, packed: Any) -> Any:
         if isinstance(packed, _PLAIN):
@@ -203,6 +218,8 @@ class _Unpacker:
     def _array(self, start: int, dtype: str, shape: list[int], order: Any) -> NDArray:
         kind = np.dtype(dtype)
         end = start + math.prod(shape) * kind.itemsize
-        if kind.hasobject or min(start, *shape, 0) < 0 or end > len(self.data):
-            raise ValueError("its arrays lie outside of the file")
+        outside = start != self._end or end > len(self.data)  # or overlapping
+        if kind.hasobject or min(shape, default=0) < 0 or outside:
+            raise ValueError("its arrays do not follow one another in the file")
+        self._end = end
         return self.data[start:end].view(kind).reshape(shape, order=order).copy(order)

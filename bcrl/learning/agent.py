@@ -1,5 +1,8 @@
 """What one seed has learned, as an agent that values and chooses actions."""
 
+import math
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -7,7 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector.utils import iterate
+from gymnasium.vector.utils import batch_space, iterate
 from numpy.typing import NDArray
 
 from bcrl.envs import Env, is_simulated
@@ -20,7 +23,7 @@ from bcrl.learning.transfer import Acting
 from bcrl.q.functions import ZERO, Q
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Agent:
     """An agent that was loaded: its Q-functions, its task and its run's config."""
 
@@ -29,13 +32,16 @@ class Agent:
     seed: int
     learned: Learned
 
+    def __repr__(self) -> str:
+        return f"Agent({self.task.name}, seed {self.seed})"
+
     @property
     def residuals(self) -> tuple["Residual", ...]:
         """ϱ of the stages that were kept; all stages with boosting or keep=stages."""
         return tuple(Residual(self, own) for own in self.learned.residuals)
 
     def q(self, observations: Any) -> Floats:
-        """The values (n, A) of all actions at n observations of the task."""
+        """The values (n, A) of all actions at n observations of the task, or at one."""
         return self.values(self.learned.result.q, observations)
 
     def values(self, q: Q, observations: Any) -> Floats:
@@ -53,7 +59,7 @@ class Agent:
         Of equally good actions it takes the first, or with `rng` any one.
         """
         alone = self._is_one(observation)
-        states = self.states([observation] if alone else observation)
+        states = self.states(observation)
         u = np.zeros((len(states), 3)) if rng is None else rng.random((len(states), 3))
         chosen = self.choose(states[None], u[None])[0] + self._first_action
         return int(chosen[0]) if alone else chosen
@@ -78,20 +84,34 @@ class Agent:
         return gymnasium.wrappers.TimeLimit(make(render_mode), task.horizon)
 
     def states(self, observations: Any) -> Floats:
-        """Observations of the task's Gymnasium environment as vectors (n, d)."""
-        simulator = self._simulator
-        if simulator is None or isinstance(simulator.members, spaces.Box):
-            found = np.asarray(observations, np.float64)
-            found = found.reshape(len(found), -1)
-        else:
-            if isinstance(observations, (dict, tuple)):
-                observations = iterate(simulator.space, observations)
-            each = [simulator.vector("observation", one) for one in observations]
-            found = np.array(each).reshape(-1, self.task.state_dim)
-        if found.shape[1:] != (d := self.task.state_dim,):
-            what = f"observations with {found.shape[-1]} numbers"
-            raise BcrlError(f"{what}; {self.task.name} has {d}: pass (n, {d})")
-        return found
+        """Observations of the task's Gymnasium environment, or one, as vectors (n, d).
+
+        A vector environment's are taken, too. Raises BcrlError for others.
+        """
+        if self._is_one(observations):
+            observations = [observations]
+        d, simulator = self.task.state_dim, self._simulator
+        try:
+            if simulator is None or isinstance(simulator.members, spaces.Box):
+                found = np.asarray(observations, np.float64)
+            else:
+                each = self._separate(simulator.space, observations)
+                found = np.array([simulator.vector("observation", o) for o in each])
+                found = found.reshape(-1, d)
+        except (LookupError, TypeError, ValueError) as error:
+            why = f"these are no observations of {self.task.name}: {error}"
+            raise BcrlError(why) from error
+        if not found.ndim or (len(found) and math.prod(found.shape[1:]) != d):
+            what = f"observations of the shape {found.shape}"
+            raise BcrlError(f"{what}; {self.task.name} has {d} numbers: pass (n, {d})")
+        return found.reshape(-1, d)
+
+    def _separate(self, space: spaces.Space, observations: Any) -> Iterable[Any]:
+        """Each of several observations, also of those that are joined part by part."""
+        joined = isinstance(observations, (dict, tuple))
+        if joined and not all(map(self._is_one, observations)):
+            return iterate(batch_space(space), observations)
+        return observations
 
     @cached_property
     def _simulator(self) -> Any:
@@ -108,14 +128,17 @@ class Agent:
         return 0 if self._simulator is None else int(self._simulator.actions.start)
 
     def _is_one(self, observation: Any) -> bool:
-        """Whether it is one observation, not an array of them."""
+        """Whether it is one observation, not several of them."""
         space = None if self._simulator is None else self._simulator.space
-        if space is None or isinstance(space, spaces.Box):
-            return np.ndim(observation) == (len(space.shape) if space else 1)
-        return bool(space.contains(observation))
+        if space is not None and not isinstance(space, spaces.Box):
+            return bool(space.contains(observation))
+        shape = space.shape if space else (self.task.state_dim,)
+        with suppress(ValueError):  # rows of several lengths
+            return np.shape(observation) == shape
+        return False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Residual:
     """The residual of one stage of an agent."""
 
@@ -125,3 +148,6 @@ class Residual:
     def q(self, observations: Any) -> NDArray[np.float64]:
         """Its values (n, A) at n observations."""
         return self.agent.values(self.own, observations)
+
+    def __repr__(self) -> str:
+        return f"Residual({self.agent})"

@@ -5,7 +5,7 @@ docs/howto/agents.md describes both files.
 
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from bcrl.common.files import write_bytes
 from bcrl.errors import BcrlError
 from bcrl.learning.agent import Agent
 from bcrl.learning.policies import combined_actions
+from bcrl.learning.transfer import Acting
 from bcrl.q.forest.forest import Forest
 from bcrl.q.functions import ZERO, Q, Shaped, Sum, Table
 from bcrl.q.quadratic import Quadratic
@@ -48,16 +49,25 @@ def layers_of(q: Q) -> list[tuple[NDArray, NDArray]]:
 
 
 def _npz(agent: Agent) -> bytes:
-    """Arrays, and the JSON text `about` that says how Q is made of them."""
+    """Arrays, and the JSON text `about` that says how Q and policy are made of them."""
     arrays: dict[str, Any] = {}
-    labels = iter(range(10**9))
+    labels: dict[int, str] = {}
 
-    def put(kind: str, **parts: NDArray) -> dict[str, Any]:
-        label = f"{kind}_{next(labels)}"
-        arrays.update({f"{label}.{name}": part for name, part in parts.items()})
-        return {kind: label}
+    def put(of: Any, kind: str, **parts: NDArray) -> dict[str, Any]:
+        if id(of) not in labels:
+            label = labels[id(of)] = f"{kind}_{len(labels)}"
+            arrays.update({f"{label}.{name}": part for name, part in parts.items()})
+        return {kind: labels[id(of)]}
 
-    about = {"q": _described(agent.learned.result.q, put), "task": repr(agent.task)}
+    result, task = agent.learned.result, agent.task
+    acting = result.acting or Acting(result.q, np.zeros(1, bool))
+    own = acting.prior if acting.copying[0] else acting.own
+    policy = {"greedy": _described(own, put)}
+    if acting.prior is not ZERO:
+        table = combined_actions(task.actions)
+        policy |= {"prior": _described(acting.prior, put)}
+        policy |= put(acting, "combined", actions=table)
+    about = {"q": _described(result.q, put), "policy": policy, "task": repr(task)}
     np.savez(file := io.BytesIO(), about=np.array(json.dumps(about)), **arrays)
     return file.getvalue()
 
@@ -72,19 +82,18 @@ def _described(q: Q, put: Put) -> Any:
         parts = {"base": q.base, "residual": q.residual, "potential": q.potential}
         return {"shaped": {name: _described(part, put) for name, part in parts.items()}}
     if isinstance(q, Table):
-        return put("table", states=q.env.states(), values=np.asarray(q.values[0]))
+        return put(q, "table", states=q.env.states(), values=np.asarray(q.values[0]))
     if isinstance(q, Quadratic):
         own = {"matrix": q.matrix[0], "linear": q.linear[0], "actions": q.actions}
-        return put("quadratic", **own)
+        return put(q, "quadratic", **own)
     if isinstance(q, FittedQ):
         q.refit()
         models = [None if fitted is None else fitted.model for fitted in q.models[0]]
-        return {
-            "actions": [model and put("forest", **_trees(model)) for model in models]
-        }
+        forests = [model and put(model, "forest", **_trees(model)) for model in models]
+        return {"actions": forests}
     named = enumerate(layers_of(q))
     flat = {f"{'wb'[i]}{k}": x for k, layer in named for i, x in enumerate(layer)}
-    return put("network", **flat)
+    return put(q, "network", **flat)
 
 
 def _trees(model: Any) -> dict[str, NDArray]:
@@ -130,16 +139,18 @@ def _onnx(agent: Agent) -> bytes:
             made[id(q)] = _values(q)
         return made[id(q)]
 
+    def total(terms: Sequence[Q]) -> str:
+        first, *rest = (values(term) for term in terms if term is not ZERO)
+        for term in rest:
+            first = node("Add", first, term)
+        return first
+
     def _values(q: Q) -> str:
         if isinstance(q, Sum):
-            first, *rest = map(values, q.terms)
-            for term in rest:
-                first = node("Add", first, term)
-            return first
+            return total(q.terms)
         if isinstance(q, Shaped):
-            total = node("Add", values(q.base), values(q.residual))
-            axes = constant(np.array([1]))
-            return node("Add", total, node("ReduceMax", values(q.potential), axes))
+            own, axes = total((q.base, q.residual)), constant(np.array([1]))
+            return node("Add", own, node("ReduceMax", values(q.potential), axes))
         if isinstance(q, Quadratic):
             pure, cross, alone = (part[0] for part in q._parts)
             square = node(

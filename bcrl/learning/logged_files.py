@@ -132,7 +132,7 @@ def _read_npz(path: Path, file: BinaryIO) -> Arrays:
     with zipfile.ZipFile(file) as archive:
         every = archive.infolist()
         members = [m for m in every if m.filename.removesuffix(".npy") in KNOWN]
-        _check_size(path, sum(member.file_size for member in members))
+        _check_size(path, sum(m.file_size for m in members), _most(path))
         for member in members:
             with archive.open(member) as head:
                 header = _NPY[np.lib.format.read_magic(head)]
@@ -149,11 +149,17 @@ def _read_parquet(path: Path, file: BinaryIO) -> Arrays:
     from pyarrow import parquet
 
     table = parquet.ParquetFile(file)
-    about = table.metadata
-    groups = [about.row_group(number) for number in range(about.num_row_groups)]
-    columns = [group.column(n) for group in groups for n in range(group.num_columns)]
-    columns = [c for c in columns if c.path_in_schema.partition(".")[0] in KNOWN]
-    _check_size(path, 8 * sum(column.num_values for column in columns))
+    about, n_values = table.metadata, 0
+    for n in range(about.num_columns):
+        column = about.schema.column(n)
+        if column.path.partition(".")[0] in KNOWN:
+            # Texts of any length may be repeated; numbers have at most 8 bytes.
+            text = "BYTE_ARRAY" in column.physical_type
+            if text and column.logical_type.type != "FLOAT16":
+                raise unusable(path, f"{column.path} has no numbers")
+            groups = map(about.row_group, range(about.num_row_groups))
+            n_values += sum(group.column(n).num_values for group in groups)
+    _check_size(path, 8 * n_values, _most(path))
     names = [name for name in KNOWN if name in table.schema_arrow.names]
     read = table.read(columns=names)
     return {name: _values(path, name, read.column(name)) for name in names}
@@ -191,12 +197,14 @@ def _read_minari(path: Path) -> Arrays:
         found = textwrap.shorten(f"{observed} and {acted}", 200)
         why = f"has {found}, but needs flat Box observations (d,) and Discrete actions"
         raise unusable(path, why)
+    most = _most(path)
     if about["data_format"] == "hdf5":
         h5py, sizes = _package("h5py", path), list[int]()
         with h5py.File(path / "main_data.hdf5") as file:
             file.visititems(lambda _, part: sizes.append(getattr(part, "nbytes", 0)))
-        _check_size(path, sum(sizes))
+        _check_size(path, sum(sizes), most)
     parts: dict[str, list[NDArray]] = {name: [] for name in (*NEEDED, "episode")}
+    needed = 0
     for number, episode in enumerate(minari.MinariDataset(path).iterate_episodes()):
         steps, states = len(episode.actions), episode.observations
         if len(states) != steps + 1:
@@ -205,16 +213,22 @@ def _read_minari(path: Path) -> Arrays:
         ends = episode.terminations, np.full(steps, number)
         for name, values in zip(parts, (*own, *ends), strict=True):
             parts[name].append(values)
+            needed += values.nbytes
+        _check_size(path, needed, most)  # Arrow's files do not say it before
     return {name: np.concatenate(values) for name, values in parts.items()}
 
 
-def _check_size(path: Path, needed: int) -> None:
-    """Raise ConfigError if a file would take far more memory than disk."""
+def _most(path: Path) -> int:
+    """The bytes of memory that the numbers of a file or folder may take."""
     files = path.rglob("*") if path.is_dir() else [path]
-    most = max(_RATIO * sum(file.stat().st_size for file in files), _SMALL)
+    return max(_RATIO * sum(file.stat().st_size for file in files), _SMALL)
+
+
+def _check_size(path: Path, needed: int, most: int) -> None:
+    """Raise ConfigError if a file would take far more memory than disk."""
     if needed > most:
-        why = f"says that it has {needed} bytes of numbers, more than {_RATIO} times "
-        raise unusable(path, f"{why}its size; is it damaged?")
+        why = f"has {needed} bytes of numbers or more, over {_RATIO} times its size"
+        raise unusable(path, f"{why}; is it damaged?")
 
 
 def _package(name: str, wanted_by: object) -> Any:

@@ -75,10 +75,16 @@ def read_recorded(path: Path, document: Document) -> bytes:
 
 
 def read_arrays(path: Path, *names: str) -> list[NDArray[Any]]:
-    """The named arrays of an NPZ; Finding if it does not hold them."""
+    """The named arrays of an NPZ, of numbers; Finding if it does not hold them."""
     try:
         with np.load(path, allow_pickle=False) as stored:
-            return [stored[name] for name in names]
+            # Runs do not compress: the arrays take no more memory than the file.
+            if any(member.compress_type for member in stored.zip.infolist()):
+                raise ValueError("it is compressed")
+            arrays = [stored[name] for name in names]
+        if any(array.dtype.kind not in "biuf" for array in arrays):
+            raise ValueError("it has texts")
+        return arrays
     except KeyError as error:
         raise Finding(path, f"lacks what is needed ({error.args[0]})") from error
     except Exception as error:  # whatever NumPy's readers raise

@@ -14,6 +14,7 @@ from bcrl.learning.learned import AGENT_SCHEMA, Learned, given
 from bcrl.learning.stage import SeedBatch
 from bcrl.learning.transfer import StageResult
 from bcrl.q.functions import Mapped
+from bcrl.q.regressors.base import Fitted, FittedQ
 from bcrl.results.layout import AGENT, COMPLETE, recorded_seeds, seed_path, spelled
 from bcrl.results.read import read_document, read_recorded
 from bcrl.run.memory import available
@@ -60,19 +61,33 @@ def read_agent(
         why = document.get("no_agent", "it was removed")
         todo = f"delete {path.with_suffix('')}.* and run again with keep=final"
         raise BcrlError(f"{path} is missing: {why}; {todo}")
-    size = len(read_recorded(path, document))
+    read_recorded(path, document)
     if (about := serialization.read_about(path)).get("schema") != AGENT_SCHEMA:
         what = f"has schema {about.get('schema')!r} of bcrl {about.get('bcrl')}"
         raise BcrlError(f"{path} {what}; bcrl {__version__} reads {AGENT_SCHEMA}")
-    regressors = (getattr(stage.learner, "regressor", None) for stage in made.stages)
-    trees = max(getattr(regressor, "trees", 0) for regressor in regressors)
-    if (needed := _PER_BYTE * size * trees) > (there := available()):
-        what = f"{path} needs up to {needed / 2**30:.0f} GiB of memory for its trees"
-        raise BcrlError(f"{what}, but there are {there / 2**30:.0f}")
     own = serialization.read_content(path, given(made.all_stages, batch))
     if not isinstance(own, Learned) or about.get("seed") != seed:
         raise BcrlError(f"{path} holds no agent of seed {seed}; remove it")
+    _check_models(path, own, made)
     return own
+
+
+def _check_models(path: Path, own: Learned, made: Plan) -> None:
+    """Raise BcrlError if models are not one per action, or need too much memory."""
+    size, n_actions = 0, made.target.n_actions
+    for part in serialization.parts(own):
+        if isinstance(part, FittedQ) and [len(x) for x in part.models] != [n_actions]:
+            raise BcrlError(f"{path} has not one model per action; remove it")
+        if isinstance(part, Fitted):  # each gets its own trees
+            of = part.problem
+            size += of.x.nbytes + of.y.nbytes + of.multiplicity.nbytes
+    regressors = (
+        getattr(stage.learner, "regressor", None) for stage in made.all_stages
+    )
+    trees = max(getattr(regressor, "trees", 1) for regressor in regressors)
+    if (needed := _PER_BYTE * size * trees) > (there := available()):
+        what = f"{path} needs up to {needed / 2**30:.0f} GiB of memory for its trees"
+        raise BcrlError(f"{what}, but there are {there / 2**30:.0f}")
 
 
 def document_of(folder: Path, seed: int) -> dict[str, Any]:

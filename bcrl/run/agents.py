@@ -1,5 +1,6 @@
 """Loading agents, which complete seeds have left beside their results."""
 
+import os
 import re
 import warnings
 from collections.abc import Iterable
@@ -29,7 +30,7 @@ def load(run: str | Path, seed: int = 0, *, trust: str | Iterable[str] = ()) -> 
     trust: your packages that the run's config names, and that may be imported.
     Raises BcrlError if there is no such agent, or its file is not what the run wrote.
     """
-    folder = Path(run).absolute()
+    folder = Path(os.path.abspath(run))  # links stay
     document = document_of(folder, seed)
     made = _plan(folder, document, [trust] if isinstance(trust, str) else trust)
     batch = SeedBatch((seed,), np.empty((0, made.target.state_dim)), cores())

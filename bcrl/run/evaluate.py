@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -64,9 +64,14 @@ def changed(task: Env, words: Sequence[str]) -> Env:
         *above, last = name.split(".")
         place = values
         for part in above:
-            place[part] = dict(place.get(part) or {})
+            if not isinstance(below := place.get(part) or {}, Mapping):
+                raise BcrlError(f"{word}: {part} is {below}, which has no {last}")
+            place[part] = dict(below)
             place = place[part]
-        place[last] = yaml.safe_load(text)
+        try:
+            place[last] = yaml.safe_load(text)
+        except (ValueError, yaml.YAMLError) as error:
+            raise BcrlError(f"{word}: {text} is no value in YAML") from error
     return construct("env", type(task), values)
 
 

@@ -53,6 +53,15 @@ def q_of(about, arrays, x):
     return x.astype(float)
 
 
+def actions_of(policy, arrays, x):
+    """The policy's actions at x (n, d), as docs/howto/agents.md says."""
+    own = q_of(policy["greedy"], arrays, x).argmax(1)
+    if "prior" not in policy:
+        return own
+    prior = q_of(policy["prior"], arrays, x).argmax(1)
+    return arrays[f"{policy['combined']}.actions"][prior, own]
+
+
 def forest(about, arrays, x):
     """The mean of a forest's trees at x (n, d); 0 for an action without one."""
     if about is None:
@@ -81,9 +90,11 @@ def test_the_npz_is_all_that_another_program_needs(kind, tmp_path):
     expected = agent.q(x)
     scale = 1 + abs(expected).max()
     assert abs(q_of(about["q"], arrays, x) - expected).max() < 1e-6 * scale
+    actions = actions_of(about["policy"], arrays, x)
+    assert (actions == agent.act(x)).mean() > 0.999  # ties, but for rounding
 
 
-@pytest.mark.parametrize("kind", NETWORKS)
+@pytest.mark.parametrize("kind", [*NETWORKS, "dqn SC"])
 def test_onnxruntime_computes_the_same(kind, tmp_path):
     if os.environ.get("BCRL_ENVIRONMENTS") != "required":
         pytest.importorskip("onnx")

@@ -208,3 +208,16 @@ def test_a_header_cannot_claim_more_than_the_file_has(tmp_path):
     np.savez_compressed(path, reward=np.zeros(2**23), action=ARRAYS["action"])  # 64 MiB
     with pytest.raises(ConfigError, match="bytes"):
         read_transitions(path)
+
+
+@needs("pyarrow")
+def test_texts_in_parquet_are_refused_before_they_are_read(tmp_path):
+    import pandas as pd
+
+    half = vars(Transitions(**ARRAYS)) | {"reward": ARRAYS["reward"].astype("f2")}
+    path = Transitions(**half).save(tmp_path / "data.parquet")
+    assert read_transitions(path).reward.dtype == "f2"
+    for texts in (["a"] * 10, [b"a"] * 10, [["a"]] * 10):
+        pd.DataFrame({"reward": texts}).to_parquet(path)
+        with pytest.raises(ConfigError, match=r"reward.* has no numbers"):
+            read_transitions(path)

@@ -1,8 +1,10 @@
 """Agents that runs leave: their Q and actions after loading, files that are refused."""
 
+import io
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +15,13 @@ from bcrl.common import files, serialization
 from bcrl.common.seeding import stream
 from bcrl.envs import is_finite
 from bcrl.errors import BcrlError
+from bcrl.learning.learned import Learned, given
 from bcrl.learning.rollout import CHOICES, play, starts_and_draws
+from bcrl.learning.transfer import StageResult
+from bcrl.q.functions import Sum
+from bcrl.q.regressors.base import Fitted
 from bcrl.results.layout import seed_path
-from bcrl.run import evaluate, job
+from bcrl.run import agent_files, evaluate, job
 from tests.run.runs import KINDS, MAZE, about, rows, run
 
 FAST = ("maze BC", "maze C", "car_on_hill BC", "dqn SBC_released", "dqn RPL")
@@ -126,19 +132,24 @@ def resealed(path: Path, **entries) -> None:
     path.write_text(files.sealed(document))
 
 
+def replaced(made, seed, suffix, data: bytes) -> None:
+    """Put other bytes in the place of a seed's file, with their hash in its JSON."""
+    seed_path(made.directory, seed, suffix).write_bytes(data)
+    hashes = about(made, seed)["sha256"] | {suffix: files.sha256(data)}
+    resealed(seed_path(made.directory, seed, "json"), sha256=hashes)
+
+
 def test_files_that_are_not_what_a_run_wrote_are_refused(tmp_path):
     made = run(tmp_path, *MAZE)
     path = seed_path(made.directory, 0, "agent")
-    whole, json_path = path.read_bytes(), seed_path(made.directory, 0, "json")
+    whole = path.read_bytes()
     for broken in (whole[:-100], whole.replace(b"about", b"abouT"), b""):
         path.write_bytes(broken)
         with pytest.raises(BcrlError, match=r"seed_0000\.agent"):
             bcrl.load(made.directory)
     other = serialization.relabelled(seed_path(made.directory, 1, "agent"), {})
     for wrong in (b"PK\x03\x04", other, whole[:-100]):
-        path.write_bytes(wrong)
-        hashes = about(made, 0)["sha256"] | {"agent": files.sha256(wrong)}
-        resealed(json_path, sha256=hashes)
+        replaced(made, 0, "agent", wrong)
         with pytest.raises(BcrlError, match=r"seed_0000\.agent"):
             bcrl.load(made.directory)
     path.unlink()
@@ -149,12 +160,50 @@ def test_files_that_are_not_what_a_run_wrote_are_refused(tmp_path):
         bcrl.load(tmp_path / "nothing")
 
 
+def test_compressed_arrays_are_refused_because_they_can_be_of_any_size(tmp_path):
+    made = run(tmp_path, *MAZE)
+    with np.load(seed_path(made.directory, 0, "npz")) as stored:
+        np.savez_compressed(packed := io.BytesIO(), **stored)
+    replaced(made, 0, "npz", packed.getvalue())
+    with pytest.raises(BcrlError, match=r"seed_0000\.npz"):
+        bcrl.load(made.directory)
+
+
+def test_models_that_would_not_fit_are_refused_before_they_are_made(
+    tmp_path, monkeypatch
+):
+    made = run(tmp_path, *KINDS["car_on_hill plain"])
+    path, regressor = (
+        seed_path(made.directory, 0, "agent"),
+        made.stages[-1].learner.regressor,
+    )
+    limit = 10 * (size := path.stat().st_size) * regressor.trees
+    monkeypatch.setattr(agent_files, "available", lambda: limit)
+    q = replace(bcrl.load(made.directory).learned.result.q, regressor=regressor)
+    (row,) = q.models
+    copies = [replace(q, models=[[Fitted(row[0].problem)] * 2]) for _ in range(200)]
+    wider = replace(q, models=[[*row, *row]])
+    for forged, why in ((Sum(tuple(copies)), "of memory"), (wider, "per action")):
+        content = Learned(StageResult(forged, forged), ())
+        about, same = serialization.read_about(path), given(made.stages, q.team)
+        replaced(made, 0, "agent", serialization.written(about, content, same))
+        assert path.stat().st_size < 2 * size
+        with pytest.raises(BcrlError, match=why):
+            bcrl.load(made.directory)
+
+
+def test_a_run_is_found_by_any_path_to_it(tmp_path):
+    made = run(tmp_path, *MAZE)
+    (linked := tmp_path / "link" / "smoke" / "maze").mkdir(parents=True)
+    (linked / "BC-FQI").symlink_to(made.directory)
+    for path in (made.directory / ".." / "BC-FQI", linked / "BC-FQI"):
+        assert bcrl.load(path, 1).seed == 1
+
+
 def test_an_agent_of_another_seed_is_not_taken_for_this_one(tmp_path):
     made = run(tmp_path, *MAZE)
     other = seed_path(made.directory, 1, "agent").read_bytes()
-    seed_path(made.directory, 0, "agent").write_bytes(other)
-    hashes = about(made, 0)["sha256"] | {"agent": files.sha256(other)}
-    resealed(seed_path(made.directory, 0, "json"), sha256=hashes)
+    replaced(made, 0, "agent", other)
     with pytest.raises(BcrlError, match="holds no agent of seed 0"):
         bcrl.load(made.directory)
 
@@ -183,6 +232,7 @@ def test_episodes_are_evaluated_in_a_task_of_choice(tmp_path, capsys):
     assert evaluate.main([*words, "env.mass=0.8", *out]) == 0
     assert evaluate.main([*words, "--task", "1", "--out", str(path)]) == 0
     assert (tmp_path / "other.csv").read_text() == path.read_text() != first
-    for wrong in (["env.mas=1"], ["mass=1"], ["--task", "4"], ["--episodes", "0"]):
+    wrongs = ["env.mas=1"], ["mass=1"], ["--task", "4"], ["--episodes", "0"]
+    for wrong in (*wrongs, ["env.mass=[1"], ["env.mass='1"], ["env.mass.x=1"]):
         assert evaluate.main([str(made.directory), *wrong]) == 2
     assert evaluate.main([str(tmp_path)]) == 2

@@ -167,3 +167,20 @@ def test_other_minari_datasets_are_rejected(minari, collected, tmp_path):
         with pytest.raises(ConfigError, match=message):
             read_transitions(name)
     assert os.listdir(tmp_path / "minari" / "other")
+
+
+@needs("minari")
+def test_reading_arrow_stops_where_it_takes_far_more_memory_than_disk(minari):
+    from pyarrow import Table, ipc
+
+    zeros, whole = np.zeros((10, 1000)), np.zeros(10, int)
+    data = Transitions(zeros, whole, zeros[:, 0], zeros, whole > 0, whole)
+    folder = minari("large/zeros-v0", data, data_format="arrow")
+    (path,) = folder.rglob("*.arrow")
+    with ipc.open_file(path) as file:
+        batch = file.read_all().take([0] * 10_000).combine_chunks()  # 80 MB
+    packed = ipc.IpcWriteOptions(compression="zstd")
+    with ipc.new_file(path, batch.schema, options=packed) as file:
+        file.write_table(Table.from_batches(batch.to_batches()))
+    with pytest.raises(ConfigError, match="times its size"):
+        read_transitions(folder)

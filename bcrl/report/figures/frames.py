@@ -47,7 +47,11 @@ def _methods(frame: pd.DataFrame, metric: str) -> Methods:
     named = frame if "method" in frame else frame.assign(method="run")
     found: dict[str, Variant] = {}
     for method, own in named.groupby("method", sort=False):
-        varied = [x for x in settings if own[x].nunique(dropna=False) > 1]
+        try:
+            varied = [x for x in settings if own[x].nunique(dropna=False) > 1]
+        except TypeError as error:
+            why = f"must have one number or text per cell in {', '.join(settings)}"
+            raise BcrlError(f"frame: {why}") from error
         groups = own.groupby(varied, sort=False, dropna=False) if varied else ()
         for values, rows in groups or [((), own)]:
             given = ((k, v) for k, v in zip(varied, values, strict=True) if v == v)
@@ -69,7 +73,10 @@ def _variant_of(rows: pd.DataFrame, metric: str, family: str, label: str) -> Var
         why = "has two rows per seed and evaluation; name two runs apart in `method`"
         raise BcrlError(f"frame: {label} {why}")
     table = rows.pivot(index=index, columns="seed", values=metric)
-    values = table.to_numpy(float, copy=True).T
+    try:
+        values = table.to_numpy(float, copy=True).T
+    except (TypeError, ValueError) as error:
+        raise BcrlError(f"metric={metric}: must be a column of numbers") from error
     values[~np.isfinite(values)] = np.nan  # a gap, not a line to infinity
     stage, task, count = (table.index.get_level_values(x).to_numpy() for x in index)
     about = {"stage": stage, "task": task, "index": count, "metrics": {metric: values}}
