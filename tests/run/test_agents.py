@@ -15,7 +15,7 @@ from bcrl.envs import is_finite
 from bcrl.errors import BcrlError
 from bcrl.learning.rollout import CHOICES, play, starts_and_draws
 from bcrl.results.layout import seed_path
-from bcrl.run import evaluate, job
+from bcrl.run import job
 from tests.run.runs import KINDS, MAZE, about, rows, run
 
 FAST = ("maze BC", "maze C", "car_on_hill BC", "dqn SBC_released", "dqn RPL")
@@ -167,22 +167,3 @@ def test_a_config_that_names_code_needs_trust(tmp_path):
     resealed(path, config=document["config"] | {"env": env})
     with pytest.raises(BcrlError, match="trust='a_strangers'"):
         bcrl.load(made.directory)
-
-
-def test_episodes_are_evaluated_in_a_task_of_choice(tmp_path, capsys):
-    made = run(tmp_path, *KINDS["car_on_hill BC"])
-    words = [str(made.directory), "--episodes", "7"]
-    assert evaluate.main(words) == 0
-    path = made.directory / "evaluation.csv"
-    first = path.read_text()
-    lines = first.splitlines()
-    assert len(lines) == 1 + 2 * 7 and lines[0].startswith("seed,episode,return")
-    out = ["--out", str(tmp_path / "other.csv")]
-    assert evaluate.main([*words, "--task", "3", *out]) == 0
-    assert (tmp_path / "other.csv").read_text() == first  # the target
-    assert evaluate.main([*words, "env.mass=0.8", *out]) == 0
-    assert evaluate.main([*words, "--task", "1", "--out", str(path)]) == 0
-    assert (tmp_path / "other.csv").read_text() == path.read_text() != first
-    for wrong in (["env.mas=1"], ["mass=1"], ["--task", "4"], ["--episodes", "0"]):
-        assert evaluate.main([str(made.directory), *wrong]) == 2
-    assert evaluate.main([str(tmp_path)]) == 2
