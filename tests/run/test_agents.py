@@ -1,8 +1,8 @@
 """Agents that runs leave: their Q and actions after loading, files that are refused."""
 
 import json
-import subprocess
-import sys
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -39,25 +39,38 @@ def results(monkeypatch):
     return found
 
 
+@pytest.fixture(scope="module")
+def fresh():
+    """Calls a function in a process that has trained nothing."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        yield lambda function, *given: pool.submit(function, *given).result()
+
+
 @pytest.mark.parametrize("kind", ALL)
-def test_a_loaded_agent_has_the_runs_q_and_actions(kind, tmp_path, results):
+def test_a_loaded_agent_has_the_runs_q_and_actions(kind, tmp_path, results, fresh):
     made = run(tmp_path, *KINDS[kind])
     for seed, (result, s, n_seeds) in results.items():
-        agent = bcrl.load(made.directory, seed)
         npz = np.load(seed_path(made.directory, seed, "npz"))
         states, low, high = npz["states"], npz["states"].min(0), npz["states"].max(0)
         if not is_finite(made.target):
             rng = np.random.default_rng(seed)
             states = rng.uniform(low - 0.1, high + 0.1, (10_000, len(low)))
+        values, visited, actions = fresh(loaded, made, seed, states)
         every = np.broadcast_to(states, (n_seeds, *states.shape))
         expected = np.asarray(result.q(every, made.target.n_actions))[s]
-        assert agent.values(agent.learned.result.q, states).tobytes() == (
-            expected.tobytes()
-        )
-        played = again(made, agent, rows(made, seed)[-1])
-        length = played.length[0, 0]
-        assert (npz["trajectory"] == played.state[0, 0, : length + 1]).all()
-        assert (npz["trajectory_actions"] == played.action[0, 0, :length]).all()
+        assert values.tobytes() == expected.tobytes()
+        if kind == "lspi":  # it acts with any force, an agent with the listed ones
+            continue
+        assert visited.tobytes() == npz["trajectory"].tobytes()
+        assert actions.tolist() == npz["trajectory_actions"].tolist()
+
+
+def loaded(made, seed, states):
+    """A loaded agent's values (n, A), and the states and actions of its episode."""
+    agent = bcrl.load(made.directory, seed)
+    played = again(made, agent, rows(made, seed)[-1])
+    n = played.length[0, 0]
+    return agent.q(states), played.state[0, 0, : n + 1], played.action[0, 0, :n]
 
 
 def again(made, agent, last):
@@ -73,30 +86,27 @@ def again(made, agent, last):
     return play(env, agent.choose, start[:, :1], u[:, :, :1])
 
 
-def test_an_agent_acts_in_a_fresh_process_in_gymnasiums_loop(tmp_path):
-    words = KINDS["dqn in gymnasium"]
-    made = run(tmp_path, *words)
-    program = """if True:
-        import sys, bcrl, numpy as np
-        agent = bcrl.load(sys.argv[1], seed=1)
-        env, done = agent.make(), False
-        seen, actions = [env.reset(seed=5)[0]], []
-        while not done:
-            actions.append(agent.act(seen[-1]))
-            new, _, ended, cut, _ = env.step(actions[-1])
-            seen.append(new)
-            done = ended or cut
-        assert actions == agent.act(np.array(seen[:-1])).tolist()
-        print(agent.q(np.array(seen)).tobytes().hex(), *actions)
-    """
-    command = [sys.executable, "-c", program, str(made.directory)]
-    values, *actions = subprocess.check_output(command, text=True).split()
+def test_an_agent_acts_in_gymnasiums_loop(tmp_path, fresh):
+    made = run(tmp_path, *KINDS["dqn in gymnasium"])
+    values, actions = fresh(looped, made.directory)
     agent = bcrl.load(made.directory, seed=1)
-    env, seen = agent.make(), []
-    seen.append(env.reset(seed=5)[0])
-    for action in actions:
-        seen.append(env.step(int(action))[0])
-    assert agent.q(np.array(seen)).tobytes().hex() == values
+    env = agent.make()
+    seen = [env.reset(seed=5)[0], *(env.step(action)[0] for action in actions)]
+    assert agent.q(np.array(seen)).tobytes() == values.tobytes()
+    assert agent.act(np.array(seen[:-1])).tolist() == actions
+
+
+def looped(directory):
+    """The values at the states of an episode in Gymnasium's loop, and its actions."""
+    agent = bcrl.load(directory, seed=1)
+    env, done, actions = agent.make(), False, []
+    seen = [env.reset(seed=5)[0]]
+    while not done:
+        actions.append(agent.act(seen[-1]))
+        new, _, ended, cut, _ = env.step(actions[-1])
+        seen.append(new)
+        done = ended or cut
+    return agent.q(np.array(seen)), actions
 
 
 def test_residuals_are_kept_by_stage(tmp_path):
