@@ -153,6 +153,8 @@ def run(
     compiling.check()
     if isinstance(seeds, Integral):
         raise ConfigError("seeds", seeds, f"name them: range({seeds}) or [{seeds}]")
+    if not stages:
+        raise ConfigError("stages", stages, "must be what bcrl.api.stages(…) returns")
     seeds, metrics, last = tuple(seeds), tuple(metrics), stages[-1]
     whole = all(isinstance(seed, Integral) and seed >= 0 for seed in seeds)
     if not whole or not 0 < len(seeds) == len(set(seeds)):

@@ -52,7 +52,7 @@ def check() -> None:
         raise BcrlError("NUMBA_DISABLE_JIT=1: unset it, bcrl's loops must be compiled")
 
 
-def features() -> set[str]:
+def cpu_features() -> set[str]:
     """Features of the processor that numba compiles for, such as "+avx2"."""
     from numba.core import codegen, config  # a large import
 

@@ -49,7 +49,8 @@ def tag_of(
     }
     if not folders and _only_chooses(hydra):
         for tag, named in usual.items():
-            if named.items() <= dict(choices).items():
+            known = tag is None or given is None  # `released` says what it stands for
+            if known and named.items() <= dict(choices).items():
                 return given or tag, {}
     changes = []
     try:
@@ -87,6 +88,7 @@ def meanings(settings: Mapping[Path, Plain]) -> list[str]:
     folders: dict[tuple[str, str], list[str]] = {}  # by tag and settings
     for folder, values in settings.items():
         present = {k: v for k, v in values.items() if v != ABSENT_KEY} or values
+        present = _shorter(present)
         texts = (f"{k}={shorten(as_text(v))}" for k, v in present.items())
         if text := ", ".join(texts):
             key = folder.name.partition("@")[2], text
@@ -96,6 +98,15 @@ def meanings(settings: Mapping[Path, Plain]) -> list[str]:
         f"{f'@{tag}' if tags.count(tag) == 1 else ', '.join(names)}: {text}"
         for (tag, text), names in folders.items()
     ]
+
+
+def _shorter(values: Plain) -> Plain:
+    """Settings with the run in `start` by its name, without its own settings."""
+    found = {k: v for k, v in values.items() if not k.startswith("start.run.")}
+    if env := values.get("start.run.env"):
+        tag = values.get("start.run.tag")
+        found["start.run"] = f"{env}@{tag}" if tag else env
+    return found
 
 
 def plain_config(job: DictConfig) -> Plain:

@@ -174,7 +174,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _draw_chosen(options, how)
         if alone := [name for name in _CHOOSING if getattr(options, name)]:
             flag = f"--{alone[0].replace('_', '-')}"
-            raise BcrlError(f"{flag}: needs --compare or --sweep")
+            why = "needs --compare or --sweep; see bcrl-report --help"
+            raise BcrlError(f"{flag}: {why}")
         chosen = [*FIGURES, CURVES] if "all" in options.figures else options.figures
         runs = load_runs(options.runs_dir, options.scale, options.allow_incomplete)
         for note in runs.notes:

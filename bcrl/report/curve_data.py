@@ -15,7 +15,7 @@ _SEEDS = 20  # whose own lines can be shown, the first of a variant's
 _FIRST_SHOWN = 8  # variants that are shown at first if none has the tag
 #: Metrics that are shown at first, if the family has many.
 _SHOWN = {"DQN": ("return", "success_rate", "greedy_return")}
-_DASHES = ("7 3", "2 3", "9 3 2 3", "5 2")  # own algorithms first
+_STROKE = 2  # width of a line in page.css, pixels: dashes are in widths
 
 
 def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, Any]:
@@ -23,13 +23,7 @@ def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, 
     found = {v.name: v for v in runs.of(env, family)}
     main = [*runs.compared(env, tag, family).values()]
     ours = {v.name: v for v in main or [*found.values()][:_FIRST_SHOWN]}
-    tags = list(dict.fromkeys(v.tag for v in (ours | found).values()))
-
-    def dash(variant: Variant) -> str:
-        if place := tags.index(variant.tag) + (variant.name not in ours):
-            return _DASHES[place % len(_DASHES)]
-        return _DASHES[0] if style.dashed(variant.method) else ""
-
+    lines = style.lines_of(ours | found)
     metrics = curves.metrics_of(found)
     return {
         "id": f"{env}-{family}",
@@ -44,15 +38,16 @@ def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, 
         "labels": {metric: curves.label(family, metric) for metric in metrics},
         "shown": [m for m in metrics if m in _SHOWN.get(family, metrics)] or metrics,
         "series": [
-            {"on": name in ours, "dash": dash(variant)} | _series(variant, metrics)
+            {"on": name in ours} | _series(variant, metrics, lines[name])
             for name, variant in (ours | found).items()
         ],
     }
 
 
-def _series(variant: Variant, metrics: list[str]) -> dict[str, Any]:
-    """A variant's colours and curves, which all have the same points."""
-    rows, light = curves.spread_rows(variant), style.colour(variant.method)
+def _series(variant: Variant, metrics: list[str], line: style.Line) -> dict[str, Any]:
+    """A variant's look, as in the figures, and curves, which have the same points."""
+    rows, light = curves.spread_rows(variant), line["color"]
+    dashes = () if line["linestyle"] == "-" else line["linestyle"][1]
     drawn = {}
     for metric in (name for name in metrics if name in variant.metrics):
         values = variant.metrics[metric][:, rows]
@@ -65,11 +60,12 @@ def _series(variant: Variant, metrics: list[str]) -> dict[str, Any]:
         }
     # The same hue, light enough for a dark page; black turns nearly white.
     hue, lightness, saturation = colorsys.rgb_to_hls(*to_rgb(light))
-    lightness = max(lightness, 0.6) if lightness else 0.95
+    lightness = 0.42 + 0.55 * lightness if lightness else 0.95
     return {
         "name": variant.name,
         "light": light,
         "dark": to_hex(colorsys.hls_to_rgb(hue, lightness, saturation)),
+        "dash": " ".join(f"{_STROKE * each:g}" for each in dashes),
         "x": variant.index[rows].tolist(),
         "task": variant.task[rows].tolist(),
         "metrics": drawn,

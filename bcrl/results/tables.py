@@ -49,12 +49,12 @@ def _disorder(table: pd.DataFrame) -> str:
             return f"has a {column} that is not a whole number ≥ {least}"
         if column != "task" and (np.diff(values) < 0).any():
             return f"has {column}s that fall"
-    last = 0.0
+    last = [0.0] if (table.stage == 1).any() else []  # else another run came before
     for stage, rows in table.groupby("stage") if "iteration" in table else ():
-        steps = np.diff(rows.iteration, prepend=last)  # equal, the last may be shorter
-        if (steps[:-1] != steps[0]).any() or not 0 < steps[-1] <= steps[0]:
+        steps = np.diff([*last, *rows.iteration])  # equal, the last may be shorter
+        if (steps[:-1] != steps[:1]).any() or not (0 < steps[-1:] <= steps[:1]).all():
             return f"does not count stage {stage:.0f}'s iterations at one interval"
-        last = rows.iteration.iloc[-1]
+        last = [rows.iteration.iloc[-1]]
     return ""
 
 

@@ -31,7 +31,12 @@ def summary(plans: Sequence[Plan], seconds: float) -> str:
     lines += meanings[:_LISTED]
     lines += [f"… and {len(meanings) - _LISTED} more tags"] * (len(meanings) > _LISTED)
     lines += [line for plan in plans for line in diverging_lines(plan)]
-    return "\n".join([*lines, f"took {duration(seconds)}", _next(plans)])
+    places: dict[tuple[str, str], list[Plan]] = {}  # those of one report
+    for plan in plans:
+        scale = plan.config["scale"]["name"]
+        places.setdefault((scale, str(plan.root)), []).append(plan)
+    lines.append(f"took {duration(seconds)}")
+    return "\n".join([*lines, *map(_next, places.values())])
 
 
 def diverging_lines(plan: Plan) -> list[str]:
@@ -65,7 +70,7 @@ def _returns(values: Sequence[float]) -> str:
 
 
 def _next(plans: Sequence[Plan]) -> str:
-    """The command that draws these runs."""
+    """The command that draws these runs, of one scale and folder."""
     words = ["bcrl-report", "--scale", plans[0].config["scale"]["name"]]
     if str(plans[0].root) != "runs":
         words.append(f"runs_dir={plans[0].root}")

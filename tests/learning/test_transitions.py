@@ -41,6 +41,11 @@ ARRAYS = vars(collected(TASKS[0], 0, 1))
 N = len(ARRAYS["reward"])
 
 
+def measured(frame):
+    """A frame without the columns of the learner's settings."""
+    return frame.loc[:, ~frame.columns.str.startswith("learner.")]
+
+
 @pytest.mark.parametrize("tasks", [TASKS, LISTED], ids=["continuous", "finite"])
 @pytest.mark.parametrize("transfer", [warm_start, Boost(), Shape()], ids=str)
 def test_logged_data_that_fqi_would_collect_give_equal_numbers(
@@ -51,7 +56,7 @@ def test_logged_data_that_fqi_would_collect_give_equal_numbers(
         collected(env, 4, number).save(file)
     own = train(tasks, FQI(episodes=15, **FITS), transfer, seeds=[4])
     logged = train(tasks, [FQI(dataset=f, **FITS) for f in files], transfer, seeds=[4])
-    assert own.equals(logged)
+    assert measured(own).equals(measured(logged))
 
 
 def test_all_seeds_see_the_same_data_and_grow_trees_of_their_own():
@@ -131,7 +136,8 @@ def test_one_file_with_the_array_task_serves_a_curriculum(tmp_path):
     whole = {k: np.concatenate([part[k] for part in parts]) for k in parts[0]}
     path = Transitions(**whole).save(tmp_path / "all.npz")
     logged = train(TASKS, FQI(dataset=path, **FITS), Boost(), seeds=[4])
-    assert logged.equals(train(TASKS, FQI(episodes=15, **FITS), Boost(), seeds=[4]))
+    own = train(TASKS, FQI(episodes=15, **FITS), Boost(), seeds=[4])
+    assert measured(logged).equals(measured(own))
     with pytest.raises(ConfigError, match="task 3"):
         api.stages([*TASKS, Corridor(prize=9.0)], FQI(dataset=path, **FITS))
 

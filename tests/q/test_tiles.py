@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from bcrl.q.networks.tiles import WIDTH, multiply
+from bcrl.q.networks.tiles import SQUARE, WIDTH, multiply, turn
 
 
 @njit
@@ -52,3 +52,20 @@ def test_products_are_numpys(n_rows, columns, n_terms):
     for column in (0, columns // 2, columns - 1):
         alone = run(rows, terms, a, np.roll(right, -column, 1), 1)
         assert np.array_equal(alone[:, 0], found[:, column])
+
+
+@njit
+def turn_all(slopes, units, turned):
+    for row in range(0, len(slopes), SQUARE):
+        for column in range(0, slopes.shape[1], SQUARE):
+            turn(slopes, units, turned, row, column)
+
+
+def test_slopes_are_masked_and_transposed():
+    rng = np.random.default_rng(0)
+    slopes = rng.standard_normal((3 * SQUARE, 2 * SQUARE)).astype(np.float32)
+    units = rng.standard_normal(slopes.shape).astype(np.float32)
+    wanted, turned = np.where(units > 0, slopes, 0), np.zeros_like(slopes.T.copy())
+    turn_all(slopes, units, turned)
+    assert (slopes == wanted).all()
+    assert (turned == wanted.T).all()

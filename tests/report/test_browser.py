@@ -202,6 +202,8 @@ def test_seeds_median_and_zoom(page):
     assert page.find(centre).get_attribute("d") != before
     page.click("single seeds")
     assert len(page.all(f"{RETURN} [data-method=C-FQI] .seed")) == 6
+    (about,) = page.texts("#runs-1 .about")
+    assert "median" in about and "quartiles" in about and "single seeds" in about
     page.press(f"{RETURN} svg", "+")
     shown = page.texts(f"{RETURN} text")
     assert "T5" in shown and "T1" not in shown
@@ -277,6 +279,7 @@ def test_panels_are_downloaded(page, runs_dir, tmp_path):
     drawing = ElementTree.parse(saved["SVG"])
     texts = {text.text for text in drawing.iter(f"{SVG}text")}
     assert texts >= {"discounted return", "optimum", "FQI", "B-FQI", "BC-FQI", "T10"}
+    assert "mean over seeds, band: 95 % bootstrap interval" in texts
     colours = {path.get("stroke") for path in drawing.iter(f"{SVG}path")}
     light = ImageColor.getrgb(style.colour("BC-FQI"))
     assert f"rgb{light}" in colours

@@ -239,11 +239,14 @@ def test_a_sweep_is_coloured_by_value_and_its_ends_have_a_logarithmic_axis(tmp_p
 
 
 def test_many_values_have_a_colour_bar_and_words_an_axis_of_their_own(tmp_path):
-    write_sweep(tmp_path, {f"e{n}": {"episodes": n} for n in range(3, 10)})
+    write_sweep(tmp_path, {f"e{2**n}": {"episodes": 2**n} for n in range(7)})
     runs, methods = chosen(tmp_path, "*")
     (sweep,) = sweeps_of([*methods.values()], ["algorithm.episodes"])
     figure = figure_sweep(runs, sweep, "return", COLUMN)
     assert not figure.legends and figure.axes[1].get_ylabel() == "algorithm.episodes"
+    figure.draw_without_rendering()
+    named = {text.get_text() for text in figure.axes[1].get_yticklabels()}
+    assert named >= {"1", "2", "5", "10", "20", "50"}
     losses = {"x": {"loss": "l1"}, "y": {"loss": [2, 3]}}
     write_sweep(tmp_path, losses, "C-FQI")
     runs, methods = chosen(tmp_path, "C-FQI*")

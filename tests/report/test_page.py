@@ -142,15 +142,19 @@ def test_tags_are_there_to_be_chosen(tmp_path):
     assert "scale smoke @mine</h1>" in page_of(tmp_path, "smoke@mine")
 
 
-def test_what_the_paper_does_not_compare_differs_in_more_than_its_colour(tmp_path):
-    write_dqn(tmp_path, ("DQN", "PPR", "S-DQN"), range(2))
-    runs = load_runs(tmp_path, "smoke")
-    series = curve_data(runs, "linear_system", "DQN", None)["series"]
-    assert {s["name"]: bool(s["dash"]) for s in series} == {
-        "DQN": False,
-        "PPR": False,
-        "S-DQN": True,
+def test_a_methods_line_is_the_figures(tmp_path):
+    """Colour and dashes are the figures'; S-DQN has PPR's colour and other dashes."""
+    names = ("DQN", "C-DQN", "BC-DQN", "PPR", "S-DQN")
+    write_dqn(tmp_path, names, range(2))
+    series = curve_data(load_runs(tmp_path, "smoke"), "linear_system", "DQN", None)
+    drawn = {s["name"]: (s["light"], s["dash"]) for s in series["series"]}
+    assert {name: drawn[name] for name in names[:3]} == {
+        "DQN": ("#0072B2", "8 3.2"),
+        "C-DQN": ("#E69F00", "12 3 2.4 3"),
+        "BC-DQN": ("#D55E00", ""),
     }
+    assert drawn["PPR"][0] == drawn["S-DQN"][0]
+    assert len(set(drawn.values())) == len(names)
 
 
 def test_what_nobody_asked_for_is_not_missed(tmp_path, capsys):

@@ -45,7 +45,9 @@ def test_a_seed_is_the_same_alone_and_in_a_pool_with_other_plans(tmp_path):
 def test_the_files_of_an_fqi_run(tmp_path, env):
     p = run(tmp_path, *KINDS[f"{env} BC"])
     assert p.directory == tmp_path / "smoke" / env / "BC-FQI"
-    names = {f"seed_000{s}.{x}" for s in (0, 1) for x in ("csv", "json", "npz")}
+    names = {
+        f"seed_000{s}.{x}" for s in (0, 1) for x in ("csv", "json", "npz", "agent")
+    }
     assert {f.name for f in p.directory.iterdir()} == names | {"config.yaml"}
     assert check_tree(tmp_path)[1] == []  # headers, order of rows, finite values
     tasks = [row["task"] for row in rows(p, 0)]

@@ -5,6 +5,7 @@ import pytest
 
 import bcrl
 from bcrl.errors import BcrlError, ConfigError
+from bcrl.results import verify
 from tests.conftest import plan
 from tests.run.runs import DQN, HILL, MAZE, compared, rows, run
 
@@ -14,7 +15,7 @@ ONE = ("curriculum=off", "boosting=off", "transfer=none")
 def hill(*masses: float) -> tuple[str, ...]:
     return (
         *HILL,
-        "algorithm.iterations=2",
+        "algorithm.iterations=3",
         f"env.tasks.mass=[{','.join(map(str, masses))}]",
     )
 
@@ -27,6 +28,7 @@ def test_fqi_in_two_runs_equals_the_curriculum_in_one(variant, tmp_path):
     start = f"start.from={first.directory}"
     second = run(tmp_path / "second", *hill(1.0, 1.2), *words, start)
     assert second.variant == whole.variant
+    assert verify.main([str(tmp_path / "second")]) == 0
     for seed in (0, 1):
         assert rows(first, seed) + rows(second, seed) == rows(whole, seed)
         one, other = (bcrl.load(p.directory, seed) for p in (second, whole))

@@ -10,13 +10,13 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from bcrl.common.compiling import features
+from bcrl.common.compiling import cpu_features
 from bcrl.q.forest.lanes import instructions
 from bcrl.q.forest.split import U, inlined
 
 GROUP = 8
 #: Whether one instruction puts the lanes of a vector in any order, as `sift` needs.
-SHUFFLE = {"+avx2", "+avx512f", "+avx512vl"} <= features()
+SHUFFLE = {"+avx2", "+avx512f", "+avx512vl"} <= cpu_features()
 
 I8, I32, I64 = (ir.IntType(bits) for bits in (8, 32, 64))
 WORDS, NUMBERS = ir.VectorType(I64, GROUP), ir.VectorType(I32, GROUP)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bcrl.common.compiling import kept
-from bcrl.q.networks.tiles import WIDTH, multiply
+from bcrl.q.networks.tiles import SQUARE, WIDTH, multiply, turn
 
 FADED = 1e-30  # moments up to this size become 0: denormal numbers are slow
 #: For Adam's division and square root. An infinite weight may turn into one that is not
@@ -29,7 +29,7 @@ _entry_point = kept(nogil=True, error_model="numpy")
 class Room(NamedTuple):
     """What passes of n inputs through L layers write, with room for the last tiles."""
 
-    units: NDArray[np.float32]  # (L + 1, widest + 1, n): inputs, activations, outputs
+    units: NDArray[np.float32]  # (L + 1, widest, n): inputs, activations, outputs, ones
     slopes: NDArray[np.float32]  # the same of ∂loss/∂(what a ReLU is given)
     turned: NDArray[np.float32]  # (n, widest): one layer's slopes, transposed
     gradient: NDArray[np.float32]  # of one layer's parameters, flat
@@ -42,9 +42,9 @@ class Room(NamedTuple):
 def space(sizes, n):
     layers, widest, wide = len(sizes), sizes.max(), n + WIDTH
     return Room(
-        np.zeros((layers, widest + 1, wide), np.float32),
-        np.zeros((layers, widest + 1, wide), np.float32),
-        np.zeros((n, widest + WIDTH), np.float32),
+        np.zeros((layers, widest + SQUARE, wide), np.float32),
+        np.zeros((layers, widest + SQUARE, wide), np.float32),
+        np.zeros((n + SQUARE, widest + WIDTH), np.float32),
         np.empty((widest + 1) * widest + WIDTH, np.float32),
         np.zeros((layers, widest + 1), np.int64),
         np.zeros(layers, np.int64),
@@ -120,12 +120,9 @@ def step_of_adam(parameters, first, second, gradient, adam):
 @_compiled
 def _mask_and_turn(slopes, units, n_units, n, turned):
     """Zero the slopes where their units are off; also transpose them."""
-    zero = np.float32(0.0)
-    for k in range(n_units):
-        for b in range(n):
-            slopes[k, b] = slopes[k, b] if units[k, b] > zero else zero
-        for b in range(n):
-            turned[b, k] = slopes[k, b]
+    for k in range(0, n_units, SQUARE):
+        for b in range(0, n, SQUARE):
+            turn(slopes, units, turned, k, b)
 
 
 @_compiled

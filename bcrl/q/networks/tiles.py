@@ -12,13 +12,14 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from bcrl.common.compiling import features
+from bcrl.common.compiling import cpu_features
 
-_FEATURES = features()
+_FEATURES = cpu_features()
 #: Rows of a tile and floats per vector. With eight rows, the loop reads addresses from
 #: the stack, and in some processes it then takes up to 2.4 times as long.
 ROWS, LANES = 4, 16 if "+avx512f" in _FEATURES else 8 if "+avx2" in _FEATURES else 4
 WIDTH = 2 * LANES  # columns of a tile
+SQUARE = 8  # of the squares that `turn` transposes
 I32, I64 = ir.IntType(32), ir.IntType(64)
 FLOATS, NUMBERS = ir.VectorType(ir.FloatType(), LANES), ir.VectorType(I32, LANES)
 ZEROS = FLOATS([0.0] * LANES)
@@ -93,3 +94,45 @@ def multiply(out, columns, rows, n_rows, terms, n_terms, a, across, along, right
                 _wide(out, rows, *place, terms, n_terms, *factors)
             else:
                 _narrow(out, rows, *place, terms, n_terms, *factors)
+
+
+@intrinsic
+def turn(typing, slopes, units, turned, row, column):
+    """Zero a square of slopes where their units are off, and write it transposed."""
+
+    def generate(context, b, signature, args):
+        *arrays, row, column = args
+        slopes, units, turned = (
+            context.make_array(kind)(context, b, value)
+            for kind, value in zip(signature.args, arrays, strict=False)
+        )
+        lanes = ir.VectorType(ir.FloatType(), SQUARE)
+        order, zero = ir.VectorType(I32, SQUARE), lanes([0.0] * SQUARE)
+
+        def place(array, r, c):
+            at = b.add(b.mul(r, b.extract_value(array.shape, 1)), c)
+            return b.bitcast(b.gep(array.data, [at]), lanes.as_pointer())
+
+        block = []
+        for r in range(SQUARE):
+            k = b.add(row, I64(r))
+            value = b.load(place(slopes, k, column), align=4)
+            on = b.fcmp_ordered(">", b.load(place(units, k, column), align=4), zero)
+            block.append(b.select(on, value, zero))
+            b.store(block[r], place(slopes, k, column), align=4)
+        half = SQUARE // 2
+        while half:  # halves of smaller and smaller squares change places
+            low = [i if not i & half else i - half + SQUARE for i in range(SQUARE)]
+            high = [i + half if not i & half else i + SQUARE for i in range(SQUARE)]
+            for r in range(SQUARE):
+                if not r & half:
+                    pair = block[r], block[r + half]
+                    block[r] = b.shuffle_vector(*pair, order(low))
+                    block[r + half] = b.shuffle_vector(*pair, order(high))
+            half //= 2
+        for r in range(SQUARE):
+            b.store(block[r], place(turned, b.add(column, I64(r)), row), align=4)
+        return context.get_dummy_value()
+
+    n = types.intp
+    return types.void(slopes, units, turned, n, n), generate

@@ -1,5 +1,6 @@
 """Learning curves of any variants; Figures 1, 2 and 5 of the paper are such."""
 
+import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -25,6 +26,12 @@ _LABELS = yaml.safe_load(Path(__file__).with_name("labels.yaml").read_text("utf-
 def label(family: str, metric: str) -> str:
     """A metric in words."""
     return _LABELS[family].get(metric, metric.replace("_", " "))
+
+
+def _wrapped(text: str) -> str:
+    """A y-axis' label in lines of about the same length."""
+    lines = math.ceil(len(text) / _LABEL_WIDTH)
+    return textwrap.fill(text, len(text) // lines + 4)
 
 
 def optimum_of(methods: Methods) -> float | None:
@@ -130,7 +137,7 @@ def draw_metrics(
     """Panels of any variants of one family, tasks shaded where all variants have them
     at the same time, and what a caption says of the tasks."""
     family = next(variant.family for variant in methods.values())
-    labels = {m: textwrap.fill(label(family, m), _LABEL_WIDTH) for m in metrics}
+    labels = {m: _wrapped(label(family, m)) for m in metrics}
     spans = [] if target_only else common_spans(methods)
     rows = target_rows if target_only else spread_rows
     drawn = draw_panels(methods, labels, width, spans, rows=rows, lines=lines)

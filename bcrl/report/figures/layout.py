@@ -156,7 +156,8 @@ def _small_print(figure: Figure, lines: Sequence[str]) -> None:
     before = figure.get_supxlabel()
     limit = int(figure.get_figwidth() * 72 / (0.55 * _SMALL_PRINT))
     wrap = partial(textwrap.wrap, width=limit, break_on_hyphens=False)
-    wrapped = [part for line in lines for part in wrap(line)]
+    kept = (line.replace(" %", "\u00a0%") for line in lines)  # on one line
+    wrapped = [part for line in kept for part in wrap(line)]
     look = {"x": 0.01, "ha": "left", "fontsize": _SMALL_PRINT, "color": "0.35"}
     figure.supxlabel("\n".join(wrapped), **look)
     more = len(wrapped) - len(before.splitlines())

@@ -43,7 +43,7 @@ def _draw_target(axes: Axes, methods: Methods) -> None:
     end = max(int(variant.index[-1]) for variant in methods.values())
     axes.set(xlim=(0, 1.03 * end), ylabel="return in the target task\n(undiscounted)")
     bottom, top = axes.get_ylim()
-    axes.set_ylim(bottom=min(bottom, _WORST - 0.07 * (top - _WORST)))  # room for a word
+    axes.set_ylim(bottom=min(bottom, _WORST - 0.1 * (top - _WORST)))  # room for a word
     switches = {
         (int(v.index[rows[-1]]), v.sidecars[0]["learners"][0])
         for v in methods.values()
@@ -68,19 +68,19 @@ def _draw_pretraining(axes: Axes, methods: Methods) -> None:
         label = f"{_LEARNERS[learner]}, {n} seed{'s' * (n != 1)}"
         (line,) = style.lines_of([source]).values()
         handles.append(Line2D([], [], label=label, **line))
-    if handles:
-        axes.legend(handles=handles, loc="lower right")
+    if handles:  # above the axes, where no curve is
+        place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
+        axes.legend(handles=handles, title="pretraining", **place)
     else:
         axes.text(0.5, 0.5, "no pretraining", transform=axes.transAxes, **style.EMPTY)
     axes.set_ylabel("discounted return\nin the LQ task")
-    axes.set_title("pretraining", pad=3)
 
 
 def figure_4a(runs: Runs, tag: str | None = None, width: float = layout.TEXT) -> Figure:
     """Linear system: return against environment steps, and the pretraining's own.
     Mean and 95 % interval over seeds, under the exploring policy (paper, Fig. 4a)."""
     methods = runs.compared(LINEAR, tag, "DQN")
-    figure, grid = layout.blocks(width, (2.0, 1.0), 2.4)
+    figure, grid = layout.blocks(width, (2.0, 1.0), 2.6)
     left, right = figure.subplots(**grid)
     _draw_target(left, methods)
     _draw_pretraining(right, methods)

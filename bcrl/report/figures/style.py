@@ -15,6 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from bcrl.report.variants import Variant
 
 _DASHED, _DASH_DOT, _DOTTED = (4.0, 1.6), (6.0, 1.5, 1.2, 1.5), (1.2, 1.2)
+_LONG_DASHED = (8.0, 2.0)
 #: By way of transfer, for FQI and DQN alike: colour, dashes (points; none: solid) and
 #: marker. Colours are Okabe and Ito's but yellow; the rest tells them apart in grey.
 LOOKS: dict[str, tuple[str, tuple[float, ...], str]] = {
@@ -22,13 +23,13 @@ LOOKS: dict[str, tuple[str, tuple[float, ...], str]] = {
     "C": ("#E69F00", _DASH_DOT, "s"),
     "B": ("#009E73", _DOTTED, "^"),
     "BC": ("#D55E00", (), "D"),
-    "SC": ("#56B4E9", _DASHED, "v"),
+    "SC": ("#56B4E9", _LONG_DASHED, "v"),
     "SBC": ("#CC79A7", (), "P"),
     "RPL": ("#000000", _DASH_DOT, "X"),
     "PPR": ("#8C8C8C", _DOTTED, "h"),
     "LSPI": ("#7A4B1E", (), "<"),  # pretraining only
 }
-_DASHES = ((), _DASHED, _DOTTED, _DASH_DOT)
+_DASHES = ((), _DASHED, _DOTTED, _DASH_DOT, _LONG_DASHED)
 _MARKERS = "osD^vPX<>h"
 _MARKS = 6  # on a curve, about
 _BANDS = ("#EBEBEB", "#F8F8F8")
@@ -59,11 +60,6 @@ def _prefix(name: str) -> str:
 def colour(method: str) -> str:
     """A method's colour by its prefix: `BC-FQI` and `BC-DQN` look alike."""
     return LOOKS[_prefix(method)][0]
-
-
-def dashed(method: str) -> bool:
-    """Whether it is another algorithm than the families': its lines are dashed."""
-    return method not in LOOKS and method.rpartition("-")[2] not in ("FQI", "DQN")
 
 
 def lines_of(names: Iterable[str]) -> dict[str, Line]:
@@ -128,7 +124,7 @@ def shade_tasks(axes: Axes, spans: Sequence[Span]) -> None:
 
 def number_axis(axes: Axes) -> None:
     """Whole numbers on the x-axis, with a thin space at the thousands: `40 000`."""
-    few = 5 if _width(axes) < 216 else 8
+    few = 4 if _width(axes) < 216 else 8
     axes.xaxis.set_major_locator(MaxNLocator(few, integer=True, steps=[1, 2, 5, 10]))
     axes.xaxis.set_major_formatter(lambda x, _: f"{x:,.0f}".replace(",", "\u2009"))
 

@@ -6,9 +6,11 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from bcrl.report.figures import curves, layout, style
 from bcrl.report.sweeps import Sweep, is_numeric, sorted_values, text_of
@@ -17,6 +19,7 @@ from bcrl.results.outcomes import WINDOW
 from bcrl.results.statistics import bootstrap
 
 _DECADE = 10.0  # numbers that span this factor have a logarithmic axis
+_MANY = 200.0  # from this factor on, only powers of ten are named
 _NAMED = 6  # values that a legend or an axis lists; of more a scale shows some
 _WRITTEN = 8  # columns of a heat map whose cells show their numbers
 _COLOURS = matplotlib.colormaps["viridis"]  # its lightness rises: it serves in grey
@@ -28,6 +31,14 @@ def _by_decades(values: Sequence[Any]) -> bool:
     """Whether an axis of these is logarithmic: positive numbers that span decades."""
     wide = is_numeric(values) and min(values) > 0
     return wide and bool(max(values) >= _DECADE * min(values))
+
+
+def _mark_decades(axis: Axis, values: Sequence[Any]) -> None:
+    """Plain numbers on a logarithmic axis: `1 2 5 10`, or `1 10` if these are many."""
+    few = max(values) < _MANY * min(values)
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
+    axis.set_major_formatter(lambda x, _: text_of(x))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _norm(values: Sequence[Any]) -> Normalize:
@@ -54,7 +65,10 @@ def figure_sweep(
     if barred:
         shown = _COLOURS(np.linspace(0, _LIGHTEST, 256))
         scale = ScalarMappable(norm, matplotlib.colors.ListedColormap(shown))
-        style.colour_bar(axes, scale, shrink=1.0, aspect=25).set_label(key)
+        bar = style.colour_bar(axes, scale, shrink=1.0, aspect=25)
+        bar.set_label(key)
+        if isinstance(norm, LogNorm):
+            _mark_decades(bar.ax.yaxis, values)
     else:
         layout.legend(figure, lines.items(), key)
     what = f"{sweep.label}, colour: {key}, {curves.BAND}{shaded}"
@@ -79,6 +93,7 @@ def figure_final(
         axes.errorbar(x, mean, error, capsize=2.0, elinewidth=0.8, **lines[sweep.label])
     if numeric and _by_decades(values):
         axes.set_xscale("log")
+        _mark_decades(axes.xaxis, values)
     if not numeric or len(values) <= _NAMED:
         axes.minorticks_off()
         axes.set_xticks(values if numeric else range(len(values)))

@@ -62,6 +62,8 @@ const downloads = (() => {
       entry.setAttribute("transform", `translate(${x} ${y})`);
       x += wide;
     }
+    y += ROW;
+    legend.append(svg("text", { x: 4, y }, view.drawn));
     const size = { width, height: y + 8 };
     for (const [key, value] of Object.entries(size)) {
       root.setAttribute(key, value);

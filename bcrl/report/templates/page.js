@@ -88,7 +88,8 @@
       const hint = "Hover, tap, or focus a panel and use the arrow keys, for values; drag, or "
         + "+ and −, to zoom; double-click or Esc shows all. Shift-click shows one method only.";
       const help = html("p", { class: "hint", id: this.hint }, hint);
-      place.append(this.controls(), this.panels, help, this.live);
+      this.about = html("p", { class: "hint about" });
+      place.append(this.controls(), this.panels, this.about, help, this.live);
       this.draw();
       // On paper a panel has another width; a tap elsewhere takes the values away.
       const printing = (on) => () => { this.printing = on; this.draw(); };
@@ -189,8 +190,19 @@
       return low < high ? [low, high] : [low - 0.5, high + 0.5];
     }
 
+    /** What lines and bands are, in words. */
+    get drawn() {
+      const { centre, spread, seeds } = this.state;
+      const bands = { mean: "95 % bootstrap interval", median: "quartiles" };
+      return [
+        `${centre} over seeds`, ...(spread ? [`band: ${bands[centre]}`] : []),
+        ...(seeds ? ["thin: single seeds"] : []),
+      ].join(", ");
+    }
+
     draw() {
       this.cursor = null;
+      this.about.textContent = `Lines: ${this.drawn}.`;
       const shown = this.data.metrics.filter((metric) => this.state.metrics.has(metric));
       const focused = document.activeElement?.closest?.(".panel")?.dataset.metric;
       this.panels.replaceChildren(...shown.map((metric) => this.panel(metric)));
@@ -280,7 +292,10 @@
       panel.append(root);
       const xs = [...new Set(lines.flatMap((l) => l.x))]
         .filter((x) => x >= x0 && x <= x1).sort((a, b) => a - b);
-      const view = { metric, panel, svg: root, overlay, lines, xs, toX, toY, width, right, bottom };
+      const { drawn } = this;
+      const view = {
+        metric, panel, svg: root, overlay, lines, drawn, xs, toX, toY, width, right, bottom,
+      };
       this.listen(view);
       return view;
     }
