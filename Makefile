@@ -77,6 +77,7 @@ bench: $(READY) ## measure speed, as ratios against a plain implementation in on
 	$(BIN)/python bench/dqn.py
 	$(BIN)/python bench/methods.py
 	$(BIN)/python bench/checkpoints.py
+	$(BIN)/python bench/agents.py
 	$(BIN)/python bench/classic.py
 	test ! -d runs/paper || $(BIN)/python bench/paper.py
 

@@ -35,6 +35,7 @@ SCHEME = {
 }
 NEEDED = tuple(SCHEME)[:5]
 TERMINATED = "terminated"  # Gymnasium's word for `absorbing`
+ENDINGS = (".npz", ".parquet")
 KNOWN = (*SCHEME, TERMINATED)  # what else a file has is not read
 #: Compressed files may take so many times their size in memory, and small ones 64 MiB.
 _RATIO, _SMALL = 200, 64 * 2**20
@@ -63,7 +64,7 @@ def locate(name: str) -> Path:
     for folder in (place, os.path.join(place, "data")):
         if os.path.isfile(os.path.join(folder, "metadata.json")):
             return Path(folder)
-    if os.path.isfile(place) and place.endswith((".npz", ".parquet")):
+    if os.path.isfile(place) and place.endswith(ENDINGS):
         return Path(place)
     raise unusable(name, why)
 
@@ -108,13 +109,21 @@ def load_arrays(path: Path) -> Arrays:
         raise unusable(path, why) from error
 
 
+def check_target(path: Path) -> None:
+    """Raise ConfigError if `save_arrays` could not write a file of this name."""
+    if path.suffix not in ENDINGS:
+        raise ConfigError("path", path, f"its name must end in {' or '.join(ENDINGS)}")
+    if not (folder := path.absolute().parent).is_dir():
+        raise ConfigError("path", path, f"there is no folder {folder}; make it first")
+    if path.suffix == ".parquet":
+        _package("pyarrow", path)
+
+
 def save_arrays(path: Path, arrays: Mapping[str, Any]) -> Path:
     """Write arrays of the scheme as NPZ or Parquet, by the name's end, atomically."""
+    check_target(path)
     if path.suffix == ".npz":
         return write_atomically(path, lambda file: np.savez(file, **arrays))
-    if path.suffix != ".parquet":
-        raise ConfigError("path", path, "its name must end in .npz or .parquet")
-    _package("pyarrow", path)
     import pyarrow
     from pyarrow import parquet
 

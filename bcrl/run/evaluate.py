@@ -16,15 +16,19 @@ from bcrl.common.checks import construct
 from bcrl.common.files import write_text
 from bcrl.common.seeding import stream
 from bcrl.common.terminal import ready, say, show
+from bcrl.common.text import estimate
 from bcrl.envs import Env, tasks_of
 from bcrl.errors import BcrlError
 from bcrl.learning.agent import Agent
+from bcrl.learning.logged_files import check_target
 from bcrl.learning.rollout import CHOICES, Episodes, play, starts_and_draws, success_of
-from bcrl.results.layout import recorded_seeds
+from bcrl.learning.transitions import Transitions
+from bcrl.results.layout import AGENT, recorded_seeds
 from bcrl.run.agents import load
 
 _ABOUT = """Play greedy episodes with the agents of a run, write one row per episode to
 a CSV and print the returns. Words such as env.mass=1.4 change the task."""
+_RETURNS = ["return", "discounted_return"]
 
 
 def episodes(agent: Agent, env: Env, n: int) -> Episodes:
@@ -49,6 +53,25 @@ def table(agent: Agent, env: Env, played: Episodes) -> pd.DataFrame:
     frame.insert(0, "episode", np.arange(len(frame)))
     frame.insert(0, "seed", agent.seed)
     return frame
+
+
+def transitions(played: Sequence[Episodes]) -> Transitions:
+    """All transitions of several seeds' episodes, in order of the seeds."""
+    names = ("state", "action", "reward", "absorbing", "length", "start")
+    each = ([getattr(own, name) for own in played] for name in names)
+    return Transitions.of_episodes(Episodes(*(np.concatenate(x, 1) for x in each)))
+
+
+def means(rows: pd.DataFrame) -> str:
+    """The mean returns and their 95 % intervals: over seeds, or one seed's episodes."""
+    from bcrl.results.statistics import bootstrap  # SciPy is slow to import
+
+    values, over = rows.groupby("seed")[_RETURNS].mean(), "seeds"
+    if len(values) == 1:
+        values, over = rows[_RETURNS], f"episodes of seed {rows['seed'].iloc[0]}"
+    found = (f"{k} {estimate(x.mean(), bootstrap(x))}" for k, x in values.items())
+    what = f"mean [95 % bootstrap interval] over {len(values)} {over}"
+    return f"{what}: {', '.join(found)}"
 
 
 def changed(task: Env, words: Sequence[str]) -> Env:
@@ -102,20 +125,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _evaluate(asked: argparse.Namespace) -> None:
     if asked.episodes < 1:
         raise BcrlError(f"--episodes {asked.episodes}: must be at least 1")
-    seeds = asked.seed or recorded_seeds(asked.run, "agent")
+    if asked.record:
+        check_target(asked.record)
+    seeds = sorted({*asked.seed}) or recorded_seeds(asked.run, AGENT)
     if not seeds:
         raise BcrlError(f"{asked.run} has no agents; name a folder that a run has made")
-    found = []
+    found, logged = [], []
     for seed in seeds:
         agent = load(asked.run, seed, trust=asked.trust)
         env = _task(agent, asked.task, asked.overrides)
-        found.append(table(agent, env, episodes(agent, env, asked.episodes)))
+        played = episodes(agent, env, asked.episodes)
+        found.append(table(agent, env, played))
+        logged += [played] if asked.record else []
     whole = pd.concat(found, ignore_index=True)
     path = asked.out or asked.run / "evaluation.csv"
     write_text(path, whole.to_csv(index=False))
-    each = whole.groupby("seed")[["return", "discounted_return", "solved"]].mean()
+    each = whole.groupby("seed")[[*_RETURNS, "solved"]].mean()
     show(each.round(4).to_string())
+    show(means(whole))
     show(f"{len(whole)} episodes in {path}")
+    if asked.record:
+        data = transitions(logged)
+        show(f"{len(data.reward)} transitions in {data.save(asked.record)}")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -124,10 +155,12 @@ def _parser() -> argparse.ArgumentParser:
     add("run", type=Path, metavar="RUN", help="the folder of a variant's results")
     add("overrides", nargs="*", metavar="env.KEY=VALUE", help="constants of the task")
     add("--episodes", type=int, default=100, help="of each seed; default: %(default)s")
-    add("--seed", type=int, action="append", help="only this one; may be repeated")
+    more = {"action": "append", "default": []}
+    add("--seed", type=int, help="only this one; may be repeated", **more)
     add("--task", type=int, help="number of the run's task, from 1; default: the last")
     add("--out", type=Path, metavar="CSV", help="default: RUN/evaluation.csv")
-    add("--trust", action="append", default=[], metavar="PACKAGE", help="of your own")
+    add("--record", type=Path, metavar="FILE", help="log transitions: *.npz, *.parquet")
+    add("--trust", metavar="PACKAGE", help="of your own", **more)
     add("--version", action="version", version=f"bcrl {__version__}")
     return parser
 

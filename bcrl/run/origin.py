@@ -37,7 +37,9 @@ def run_origin() -> dict[str, Any]:
 
 def _git(*arguments: str) -> str | None:
     """Git's output in this package's folder; None if the command fails."""
-    command = ["git", "-C", str(Path(__file__).resolve().parents[1]), *arguments]
+    folder = str(Path(__file__).resolve().parents[1])
+    # If the timeout kills a command without locks, it leaves none in the repository.
+    command = ["git", "--no-optional-locks", "-C", folder, *arguments]
     with suppress(OSError, subprocess.SubprocessError):
         done = subprocess.run(command, capture_output=True, timeout=10, check=True)
         return done.stdout.decode(errors="replace").strip()

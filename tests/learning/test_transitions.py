@@ -14,6 +14,7 @@ from bcrl.errors import ConfigError
 from bcrl.learning.rollout import rollout, starts_and_draws
 from bcrl.learning.transitions import read_transitions
 from bcrl.q.functions import ZERO
+from bcrl.results.layout import SETTING
 from tests.offline import needs
 from tests.toys import Corridor, OpenCorridor
 
@@ -30,8 +31,10 @@ def collected(env, seed, stage, episodes=15):
 
 
 def train(tasks, learners, *transfers, seeds=(0,)):
+    """The rows of a run, without its learners' settings."""
     course = api.stages(tasks, learners, *transfers)
-    return api.run(course, seeds, ("return", "residual_start"), progress=False)
+    frame = api.run(course, seeds, ("return", "residual_start"), progress=False)
+    return frame.loc[:, ~frame.columns.str.startswith(SETTING)]
 
 
 ARRAYS = vars(collected(TASKS[0], 0, 1))

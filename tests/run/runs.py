@@ -21,17 +21,18 @@ LINEAR = ("env=linear_system", "algorithm=dqn", "scale=smoke", "progress=none")
 #: DQN in a second: 40 updates after the random steps, with several target copies.
 DQN = (*LINEAR, "seeds.count=2", "scale.max_steps=540", "algorithm.target_update=7")
 DQN += ("algorithm.evaluation_episodes=3", "tag=x")
-METHODS = ("plain", "C", "BC", "SC", "SBC", "RPL", "PPR")
+METHODS = ("plain", "C", "B", "BC", "SC", "SBC", "RPL", "PPR")
 METHODS += ("BC_released", "SC_released", "SBC_released")
 HILL = ("env=car_on_hill", *FQI, "tag=x")
 SHORT = (*HILL, "env.horizon=20")
+LQ = ("env.tasks.task=[lq]", "env.tasks.horizon=[100]", "algorithm.steps=400")
 SMALL = tuple(word for word in DQN if word != "env=linear_system")
 CART = ("env.horizon=90", "scale.max_steps=150", "algorithm.learning_starts=60")
 #: Every variant of the paper, and others; RPL's offset is shorter than the run.
 KINDS = {
     f"{env} {name}": (f"env={env}", f"variant={name}", *FQI)
     for env in ("car_on_hill", "maze")
-    for name in ("plain", "C", "B", "BC", "SC")
+    for name in ("plain", "C", "B", "BC", "SC", "SBC")
 }
 KINDS |= {f"dqn {name}": (*DQN, f"variant={name}") for name in METHODS}
 KINDS["dqn RPL"] += ("transfer.offset=510",)
@@ -39,6 +40,8 @@ KINDS |= {
     "dqn in the maze": ("env=maze", *SMALL, "variant=SBC", "scale.max_steps=100"),
     "dqn on the hill": ("env=car_on_hill", *SMALL, "variant=PPR"),
     "dqn in gymnasium": ("env=cart_pole", *SMALL, "variant=SBC", *CART),
+    "lspi": (*DQN, *LQ, "algorithm.learners=lspi"),
+    "tables": (*TABULAR, "variant=BC"),
     "fqi on the system": ("env=linear_system", "variant=BC", *FQI),
     "fqi in gymnasium": ("env=acrobot", "variant=BC", *FQI, "env.horizon=15"),
     "sklearn's forest": (*SHORT, "variant=BC", "algorithm/regressor=sklearn_forest"),
