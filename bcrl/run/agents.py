@@ -1,7 +1,6 @@
 """Loading agents, which complete seeds have left beside their results."""
 
 import re
-import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -14,12 +13,8 @@ from bcrl.config.plan import Plan, plan
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.learning.agent import Agent
 from bcrl.learning.stage import SeedBatch
-from bcrl.results.layout import AGENT, seed_path
-from bcrl.results.read import read_arrays, read_recorded
-from bcrl.run.agent_files import document_of, read_agent
+from bcrl.run.agent_files import check_recorded, document_of, read_agent
 from bcrl.run.workers import cores
-
-_NEAR = 1e-3  # share of Q's size that another processor's rounding may change
 
 
 def load(run: str | Path, seed: int = 0, *, trust: str | Iterable[str] = ()) -> Agent:
@@ -34,9 +29,8 @@ def load(run: str | Path, seed: int = 0, *, trust: str | Iterable[str] = ()) -> 
     made = _plan(folder, document, [trust] if isinstance(trust, str) else trust)
     batch = SeedBatch((seed,), np.empty((0, made.target.state_dim)), cores())
     learned = read_agent(folder, seed, document, made, batch)
-    agent = Agent(made.target, document["config"], seed, learned)
-    _compare(agent, seed_path(folder, seed, "npz"), document)
-    return agent
+    check_recorded(learned.result.q, made.target, folder, {seed: document})
+    return Agent(made.target, document["config"], seed, learned)
 
 
 def _plan(folder: Path, document: dict[str, Any], trust: Iterable[str]) -> Plan:
@@ -54,21 +48,3 @@ def _plan(folder: Path, document: dict[str, Any], trust: Iterable[str]) -> Plan:
             what = f"its config names code, {error.key}={named[error.key]}; "
             what += f"trust={package!r} lets it be imported"
         raise BcrlError(f"{folder}: {what}") from error
-
-
-def _compare(agent: Agent, npz: Path, document: dict[str, Any]) -> None:
-    """Compare an agent's Q with the one that its run has recorded."""
-    read_recorded(npz, document)
-    states, recorded = read_arrays(npz, "states", "q")
-    own = agent.values(agent.learned.result.q, states).astype(recorded.dtype)
-    if np.array_equal(own, recorded, equal_nan=True):
-        return
-    if own.shape == recorded.shape:
-        difference = float(np.abs(own - recorded).max() / (1 + np.abs(recorded).max()))
-        if difference < _NEAR:
-            what = f"differs from the recorded one by {difference:.1g} of its size"
-            why = "another processor or library rounds in another way"
-            warnings.warn(f"{npz.with_suffix('')}: Q {what}; {why}", stacklevel=3)
-            return
-    why = "its Q is not the one that its run has recorded; versions of libraries differ"
-    raise BcrlError(f"{npz.with_suffix(f'.{AGENT}')}: {why}")

@@ -16,7 +16,7 @@ from bcrl.errors import BcrlError
 from bcrl.learning.rollout import CHOICES, play, starts_and_draws
 from bcrl.results.layout import seed_path
 from bcrl.run import evaluate, job
-from tests.run.runs import KINDS, MAZE, about, rows, run
+from tests.run.runs import KINDS, MAZE, SMALL, about, rows, run
 
 FAST = ("maze BC", "maze C", "car_on_hill BC", "dqn SBC_released", "dqn RPL")
 FAST += ("dqn in gymnasium", "fqi in gymnasium")
@@ -58,6 +58,30 @@ def test_a_loaded_agent_has_the_runs_q_and_actions(kind, tmp_path, results):
         length = played.length[0, 0]
         assert (npz["trajectory"] == played.state[0, 0, : length + 1]).all()
         assert (npz["trajectory_actions"] == played.action[0, 0, :length]).all()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("env.id=FrozenLake-v1",),
+        ("env.id=CartPole-v1", "env.observation=tests.toys.doubled"),
+    ],
+)
+def test_agents_of_mapped_and_flattened_observations_are_loaded(words, tmp_path):
+    dqn = "algorithm=dqn", *SMALL, "env.horizon=20", "scale.max_steps=60"
+    more = "algorithm.learning_starts=40", "env.verify=false"
+    made = run(tmp_path, "env=gymnasium", *words, *dqn, *more)
+    agent = bcrl.load(made.directory, 1, trust="tests")
+    npz = np.load(seed_path(made.directory, 1, "npz"))
+    env = agent.make()
+    first, _ = env.reset(seed=3)
+    (state,) = agent.states([first])
+    assert agent.act(first) == agent.q([first]).argmax()
+    if "env.observation" in words[-1]:
+        assert (state == 2.0 * first).all()
+    else:
+        (row,) = np.flatnonzero((npz["states"] == state).all(-1))
+        assert (agent.q([first])[0].astype(np.float32) == npz["q"][row]).all()
 
 
 def again(made, agent, last):
