@@ -64,7 +64,8 @@ def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...
         if isinstance(learner, DQN) and number > 1 and has_policy:
             learner = replace(learner, random_steps=0)
         place = known_tasks.index(env) + 1 if past.tasks else task + 1
-        made.append(Stage(number, place, env, learner, chosen.transfers, 0))
+        own = task + 1 if past.tasks else 0
+        made.append(Stage(number, place, env, learner, chosen.transfers, 0, own))
     ready = [_capped(stage.learner, chosen.scale) for stage in made]
     before = accumulate((learner.length for learner in ready), initial=past.count)
     each = zip(made, ready, before, strict=False)
