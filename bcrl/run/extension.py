@@ -11,6 +11,7 @@ from typing import Any
 
 from bcrl.common import serialization
 from bcrl.common.files import write_atomically, write_bytes
+from bcrl.common.identity import identity
 from bcrl.config.plan import Plan, plan
 from bcrl.errors import ConfigError
 from bcrl.learning.stage import CurriculumRun
@@ -86,7 +87,8 @@ def _check(longer: Plan, shorter: Plan, named: str) -> None:
     if length is None:
         why = f"ends with {learner.name}; only FQI and DQN go on from a state"
     elif old[0] != new[0]:
-        why = "has other tasks, metrics or stages; only the last stage may be longer"
+        why = "starts from other agents, or has other tasks, metrics or stages; "
+        why += "only the last stage may be longer"
     elif other := [k for k in new[1] if new[1][k] != old[1].get(k) and k != length]:
         key, value = other[0], old[1].get(other[0])
         why = f"has {key}={value}, this run {new[1][key]}; only {length} may differ"
@@ -100,7 +102,8 @@ def _check(longer: Plan, shorter: Plan, named: str) -> None:
 def _parts(plan: Plan) -> tuple[tuple, dict[str, Any]]:
     """What must be equal, and the settings of the last stage's learner."""
     last = plan.stages[-1]
-    whole = plan.tasks, plan.metrics, plan.stages[:-1], type(last.learner)
+    start = identity(plan.config).get("start")
+    whole = start, plan.tasks, plan.metrics, plan.stages[:-1], type(last.learner)
     return (*whole, last.task, last.env, last.transfers, last.before), vars(
         last.learner
     )
