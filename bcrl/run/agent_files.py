@@ -17,7 +17,7 @@ from bcrl.errors import BcrlError, ConfigError
 from bcrl.learning.learned import AGENT_SCHEMA, Learned, given
 from bcrl.learning.stage import SeedBatch
 from bcrl.learning.transfer import StageResult
-from bcrl.q.functions import Q, Mapped
+from bcrl.q.functions import Mapped, Q
 from bcrl.results.layout import AGENT, COMPLETE, recorded_seeds, seed_path, spelled
 from bcrl.results.read import read_arrays, read_document, read_recorded
 from bcrl.run.memory import available
@@ -62,7 +62,8 @@ def read_agent(
     """What the agent's file of a seed holds; BcrlError unless the run wrote it."""
     path = seed_path(folder, seed, AGENT)
     if not path.exists():
-        why = document.get("no_agent", "it was removed")
+        why = document.get("no_agent", "its run kept none")
+        why = "it was removed" if AGENT in document.get("sha256", {}) else why
         todo = f"delete {path.with_suffix('')}.* and run again with keep=final"
         raise BcrlError(f"{path} is missing: {why}; {todo}")
     size = len(read_recorded(path, document))
@@ -101,10 +102,8 @@ def check_recorded(
         if own.shape == recorded.shape:
             near = np.abs(own - recorded).max() / (1 + np.abs(recorded).max())
         if not near < _NEAR:
-            why = (
-                "its Q is not the one that its run has recorded: versions of libraries"
-            )
-            why += " differ, or a class of yours lacks field(metadata=seeds_on(0))"
+            why = "its Q is not the one that its run has recorded: a library's version "
+            why += "differs, or a class of yours lacks field(metadata=seeds_on(0))"
             raise BcrlError(f"{path}: {why}")
         what = f"differs from the recorded one by {near:.1g} of its size"
         why = "another processor or library rounds in another way"

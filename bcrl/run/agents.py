@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from bcrl import __version__
 from bcrl.common import plugins
-from bcrl.config.plan import Plan, plan
+from bcrl.config.plan import Plan, recorded, unusable_config
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.learning.agent import Agent
 from bcrl.learning.stage import SeedBatch
@@ -38,11 +37,11 @@ def _plan(folder: Path, document: dict[str, Any], trust: Iterable[str]) -> Plan:
     config = document["config"]
     for name in trust:
         plugins.trust(name)
-    named = dict(plugins.named_code(config))
     try:
-        return plan(config, document["env"], document["tag"])
+        return recorded(config, document["env"], document["tag"])
     except ConfigError as error:
-        what = f"its config can't be used by bcrl {__version__}: {error}"
+        what = unusable_config(error)
+        named = dict(plugins.named_code(config))
         if error.key in named and not plugins.is_trusted(named[error.key]):
             package = re.split("[.:]", named[error.key])[0]
             what = f"its config names code, {error.key}={named[error.key]}; "

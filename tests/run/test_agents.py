@@ -1,22 +1,20 @@
 """Agents that runs leave: their Q and actions after loading, files that are refused."""
 
-import json
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import bcrl
-from bcrl.common import files, serialization
+from bcrl.common import files, seed_axis, serialization
 from bcrl.common.seeding import stream
 from bcrl.envs import is_finite
 from bcrl.errors import BcrlError
 from bcrl.learning.rollout import CHOICES, play, starts_and_draws
 from bcrl.results.layout import seed_path
-from bcrl.run import evaluate, job
-from tests.run.runs import KINDS, MAZE, SMALL, about, rows, run
+from bcrl.run import agent_files, evaluate, job
+from tests.run.runs import KINDS, MAZE, SMALL, TABULAR, about, resealed, rows, run
 
 FAST = ("maze BC", "maze C", "car_on_hill BC", "dqn SBC_released", "dqn RPL")
 FAST += ("dqn in gymnasium", "fqi in gymnasium")
@@ -144,12 +142,6 @@ def test_nothing_is_kept_if_nothing_is_asked_for(tmp_path):
         bcrl.load(made.directory)
 
 
-def resealed(path: Path, **entries) -> None:
-    """Change a JSON and its digest."""
-    document = json.loads(path.read_text()) | entries
-    path.write_text(files.sealed(document))
-
-
 def test_files_that_are_not_what_a_run_wrote_are_refused(tmp_path):
     made = run(tmp_path, *MAZE)
     path = seed_path(made.directory, 0, "agent")
@@ -191,6 +183,41 @@ def test_a_config_that_names_code_needs_trust(tmp_path):
     resealed(path, config=document["config"] | {"env": env})
     with pytest.raises(BcrlError, match="trust='a_strangers'"):
         bcrl.load(made.directory)
+
+
+def test_what_plays_no_part_in_acting_does_not_prevent_loading(tmp_path):
+    made = run(tmp_path, *TABULAR)
+    path, config = seed_path(made.directory, 0, "json"), about(made, 0)["config"]
+    elsewhere = {"device": "cuda", "logger": {"name": "mine.Lines"}, "workers": -1}
+    older = {k: v for k, v in config.items() if k not in ("keep", "start", "extend")}
+    states = made.target.states()
+    expected = bcrl.load(made.directory, 1).q(states).shape
+    for other in (config | elsewhere, older):
+        resealed(path, config=other)
+        agent = bcrl.load(made.directory, 0)
+        assert agent.q(states).shape == expected and agent.config == other
+    for foreign in ({"env": {}}, {}, [], {**config, "env": {"name": "maze"}}):
+        resealed(path, config=foreign)
+        with pytest.raises(BcrlError, match=str(made.directory)):
+            bcrl.load(made.directory, 0)
+    seed_path(made.directory, 1, "agent").unlink()
+    hashes = about(made, 1)["sha256"]
+    for sha256, why in ((hashes, "was removed"), ({"npz": ""}, "kept none")):
+        resealed(seed_path(made.directory, 1, "json"), sha256=sha256)
+        with pytest.raises(BcrlError, match=f"missing: .*{why}.*keep=final"):
+            bcrl.load(made.directory, 1)
+
+
+def test_a_q_of_other_seeds_is_not_taken_for_theirs(tmp_path):
+    made = run(tmp_path, *TABULAR)
+    documents = {seed: agent_files.document_of(made.directory, seed) for seed in (0, 1)}
+    own = [bcrl.load(made.directory, seed).learned.result.q for seed in (0, 1)]
+    for mixed in ([own[0]] * 2, own[::-1]):
+        with pytest.raises(BcrlError, match=r"seed_000\d\.agent: .*seeds_on"):
+            q = seed_axis.joined(mixed)
+            agent_files.check_recorded(q, made.target, made.directory, documents)
+    q = seed_axis.joined(own)
+    agent_files.check_recorded(q, made.target, made.directory, documents)
 
 
 def test_episodes_are_evaluated_in_a_task_of_choice(tmp_path, capsys):
