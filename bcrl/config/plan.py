@@ -1,13 +1,14 @@
 """From a composed configuration to a plan: stages, transfers, variant, directory."""
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from bcrl import __version__
 from bcrl.common import plugins
 from bcrl.common.checks import construct, one_of
-from bcrl.common.identity import OUTPUT_KEYS, Plain
+from bcrl.common.identity import OUTPUT_KEYS, Plain, identity
 from bcrl.config.algorithms import algorithm
 from bcrl.config.rules import check_numbers
 from bcrl.config.schema import Choice, Config, Start, check_name, check_path
@@ -108,10 +109,37 @@ def plan(config: Plain, env: str, tag: str | None = None, **more: Any) -> Plan:
         lockstep=config["seeds"]["lockstep"] or own_lockstep,
         device=device,
         config=config,
-        sources=plugins.fingerprint(config),
+        sources=plugins.fingerprint(identity(config)),
         source=source,
         **more,
     )
+
+
+def recorded(
+    config: Plain, env: str, tag: str | None, data: Plain | None = None
+) -> Plan:
+    """The plan of a run by its recorded config, wherever it was made.
+
+    Keys that decide no number have their defaults. Logged data are not read, unless
+    `data`, another section `algorithm`, names the same ones. Raises ConfigError for
+    another version's config.
+    """
+    usual = asdict(Config())
+    try:
+        kept = identity(config)
+        known = kept["algorithm"].get("dataset_sha256")
+        if data and known is not None and known == data.get("dataset_sha256"):
+            kept["algorithm"] = kept["algorithm"] | {"dataset": data["dataset"]}
+        start = {"start": usual["start"] | kept.get("start", {})}
+        return plan({key: usual[key] for key in OUTPUT_KEYS} | kept | start, env, tag)
+    except (AttributeError, KeyError, TypeError) as error:
+        why = f"lacks an entry or has another form ({type(error).__name__}: {error})"
+        raise ConfigError("config", "recorded", why) from error
+
+
+def unusable_config(error: ConfigError) -> str:
+    """Why a recorded config, from which `error` follows, makes no plan."""
+    return f"its config can't be used by bcrl {__version__}: {error}"
 
 
 def _source(config: Plain, tasks: list[Env]) -> Plan | None:
@@ -123,17 +151,18 @@ def _source(config: Plain, tasks: list[Env]) -> Plan | None:
             why = "maps observations for another run's agents; name it: start.from="
             raise ConfigError("start.observation", given.observation, why)
         return None
-    output = {key: config[key] for key in OUTPUT_KEYS}
-    start = {"start": {"from": None, "observation": None}}
-    whole = start | output | given.run["config"]
-    found = plan(whole, given.run["env"], given.run["tag"])
+    folder = config["start"].get("from")
+    try:
+        found = recorded(given.run["config"], given.run["env"], given.run["tag"])
+    except ConfigError as error:
+        raise ConfigError("start.from", folder, unusable_config(error)) from error
     for name in ("n_actions", "state_dim"):
         new, old = (getattr(task, name) for task in (tasks[-1], found.target))
         if new != old and (name == "n_actions" or given.observation is None):
             why = f"its agents' {name} is {old}, but this run's is {new}"
             if name == "state_dim":
                 why += "; start.observation=module.function can map observations"
-            raise ConfigError("start.from", config["start"].get("from"), why)
+            raise ConfigError("start.from", folder, why)
     return found
 
 

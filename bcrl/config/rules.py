@@ -17,7 +17,7 @@ from bcrl.learning.fqi import FQI
 from bcrl.learning.lspi import LSPI
 from bcrl.learning.stage import Learner, Stage
 from bcrl.learning.transfer import Boost, Shape, StageInit, warm_start
-from bcrl.learning.transitions import transitions_of
+from bcrl.learning.transitions import LoggedFile, transitions_of
 from bcrl.q.functions import ZERO
 from bcrl.q.quadratic import FEATURES
 
@@ -64,7 +64,8 @@ def course(chosen: Composition, learners: Sequence[Learner]) -> tuple[Stage, ...
         if isinstance(learner, DQN) and number > 1 and has_policy:
             learner = replace(learner, random_steps=0)
         place = known_tasks.index(env) + 1 if past.tasks else task + 1
-        made.append(Stage(number, place, env, learner, chosen.transfers, 0))
+        own = task + 1 if past.tasks else 0
+        made.append(Stage(number, place, env, learner, chosen.transfers, 0, own))
     ready = [_capped(stage.learner, chosen.scale) for stage in made]
     before = accumulate((learner.length for learner in ready), initial=past.count)
     each = zip(made, ready, before, strict=False)
@@ -136,7 +137,8 @@ def _check_fqi(chosen: Composition, learner: FQI, env: Env, start: StageInit) ->
 def _check_logged(chosen: Composition, learners: Sequence[Any], slot: int) -> None:
     """Raise ConfigError for logged data that are not those of the slot's task."""
     data, env, task = learners[slot].dataset, chosen.slots[slot], chosen.order[slot] + 1
-    if data is None or transitions_of(data, task, env).task is not None:
+    unread = isinstance(data, LoggedFile) and not data.is_named
+    if data is None or unread or transitions_of(data, task, env).task is not None:
         return
     for other, learner in zip(chosen.slots, learners, strict=True):
         if getattr(learner, "dataset", None) == data and other != env:

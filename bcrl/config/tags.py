@@ -134,7 +134,10 @@ def _recorded(folder: object) -> Plain:
         raise ConfigError("start.from", folder, why)
     document = read_document(place, seeds[0])
     named = {"env": document["env"], "tag": document["tag"]}
-    return named | {"config": identity(document["config"])}
+    try:
+        return named | {"config": identity(document["config"])}
+    except (AttributeError, KeyError, TypeError) as error:
+        raise ConfigError("start.from", folder, f"its config lacks {error}") from error
 
 
 def _options(config: Plain, choices: Options, released: bool) -> Options:

@@ -143,7 +143,7 @@ class FQI:
         """The state before the first iteration, with a dataset for each seed."""
         env, previous, n = stage.env, start.previous, len(batch.seeds)
         if self.dataset is not None:
-            given = transitions_of(self.dataset, stage.task, env)
+            given = transitions_of(self.dataset, stage.own_task or stage.task, env)
             every = [dataset.of_logged(env, given, batch.probe)] * n
             return FQIState(0, every, None, {})
         if not self.new_data and previous is not None:

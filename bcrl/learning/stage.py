@@ -48,6 +48,7 @@ class Stage:
     learner: Learner
     transfers: tuple[Transfer, ...]  # from the previous stage
     before: int  # iterations or environment steps of all previous stages
+    own_task: int = 0  # its position without the tasks of a source; 0: it is `task`
 
 
 @dataclass(frozen=True)

@@ -112,6 +112,11 @@ class LoggedFile:
     name: str  # a path, or minari:ID
     sha256: str = ""  # "": any
 
+    @property
+    def is_named(self) -> bool:
+        """Whether its place is known; otherwise its hash stands for its name."""
+        return self.name != self.sha256
+
     def __str__(self) -> str:
         return self.name
 

@@ -123,6 +123,10 @@ class Mapped:
         key, name = "start.observation", self.observation
         of = plugins.attribute(key, name, name)
         seen = [np.array([of(state) for state in x], np.float64) for x in states]
+        if not any(map(len, seen)):
+            return ZERO(states, n_actions)
+        shape = next(x.shape[1:] for x in seen if len(x))
+        seen = [x if len(x) else np.empty((0, *shape)) for x in seen]
         given: Any = np.stack(seen) if isinstance(states, np.ndarray) else seen
         return self.q(given, n_actions)
 

@@ -2,25 +2,19 @@
 
 import os
 import re
-import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bcrl import __version__
 from bcrl.common import plugins
-from bcrl.config.plan import Plan, plan
+from bcrl.config.plan import Plan, recorded, unusable_config
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.learning.agent import Agent
 from bcrl.learning.stage import SeedBatch
-from bcrl.results.layout import AGENT, seed_path
-from bcrl.results.read import read_arrays, read_recorded
-from bcrl.run.agent_files import document_of, read_agent
+from bcrl.run.agent_files import check_recorded, document_of, read_agent
 from bcrl.run.workers import cores
-
-_NEAR = 1e-3  # share of Q's size that another processor's rounding may change
 
 
 def load(run: str | Path, seed: int = 0, *, trust: str | Iterable[str] = ()) -> Agent:
@@ -35,9 +29,8 @@ def load(run: str | Path, seed: int = 0, *, trust: str | Iterable[str] = ()) -> 
     made = _plan(folder, document, [trust] if isinstance(trust, str) else trust)
     batch = SeedBatch((seed,), np.empty((0, made.target.state_dim)), cores())
     learned = read_agent(folder, seed, document, made, batch)
-    agent = Agent(made.target, document["config"], seed, learned)
-    _compare(agent, seed_path(folder, seed, "npz"), document)
-    return agent
+    check_recorded(learned.result.q, made.target, folder, {seed: document})
+    return Agent(made.target, document["config"], seed, learned)
 
 
 def _plan(folder: Path, document: dict[str, Any], trust: Iterable[str]) -> Plan:
@@ -45,31 +38,13 @@ def _plan(folder: Path, document: dict[str, Any], trust: Iterable[str]) -> Plan:
     config = document["config"]
     for name in trust:
         plugins.trust(name)
-    named = dict(plugins.named_code(config))
     try:
-        return plan(config, document["env"], document["tag"])
+        return recorded(config, document["env"], document["tag"])
     except ConfigError as error:
-        what = f"its config can't be used by bcrl {__version__}: {error}"
+        what = unusable_config(error)
+        named = dict(plugins.named_code(config))
         if error.key in named and not plugins.is_trusted(named[error.key]):
             package = re.split("[.:]", named[error.key])[0]
             what = f"its config names code, {error.key}={named[error.key]}; "
             what += f"trust={package!r} lets it be imported"
         raise BcrlError(f"{folder}: {what}") from error
-
-
-def _compare(agent: Agent, npz: Path, document: dict[str, Any]) -> None:
-    """Compare an agent's Q with the one that its run has recorded."""
-    read_recorded(npz, document)
-    states, recorded = read_arrays(npz, "states", "q")
-    own = agent.values(agent.learned.result.q, states).astype(recorded.dtype)
-    if np.array_equal(own, recorded, equal_nan=True):
-        return
-    if own.shape == recorded.shape:
-        difference = float(np.abs(own - recorded).max() / (1 + np.abs(recorded).max()))
-        if difference < _NEAR:
-            what = f"differs from the recorded one by {difference:.1g} of its size"
-            why = "another processor or library rounds in another way"
-            warnings.warn(f"{npz.with_suffix('')}: Q {what}; {why}", stacklevel=3)
-            return
-    why = "its Q is not the one that its run has recorded; versions of libraries differ"
-    raise BcrlError(f"{npz.with_suffix(f'.{AGENT}')}: {why}")

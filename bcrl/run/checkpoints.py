@@ -39,12 +39,12 @@ def checkpoint_path(plan: Plan, seeds: Sequence[int], kind: str = CHECKPOINT) ->
 
 
 def batches(plan: Plan) -> set[tuple[int, ...]]:
-    """The batches of the plan's seeds that can resume.
+    """The batches that can resume, also those with seeds of other parts of the run.
 
     A checkpoint of other code or another config counts as absent: it can't lead to the
     results of an uninterrupted run. Raises BcrlError for a damaged file.
     """
-    asked, here, found = set(plan.seeds), about_of(plan), set()
+    asked, here, found = set(plan.asked), about_of(plan), set()
     for about in stored(plan.directory).values():
         if "error" in about:
             raise about["error"]

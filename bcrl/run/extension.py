@@ -6,12 +6,14 @@ which then resumes as after an interruption.
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from bcrl.common import serialization
 from bcrl.common.files import write_atomically, write_bytes
-from bcrl.config.plan import Plan, plan
+from bcrl.common.identity import identity
+from bcrl.config.plan import Plan, recorded, unusable_config
 from bcrl.errors import ConfigError
 from bcrl.learning.stage import CurriculumRun
 from bcrl.results.layout import STATE, recorded_seeds, spelled
@@ -53,29 +55,42 @@ def adopt(longer: Plan) -> None:
     if not pending:
         return
     folder = Path(named).absolute()
-    shorter = _plan(folder)
+    shorter = _plan(folder, longer)
     _check(longer, shorter, named)
     records.make_run_directory(longer)
-    found, about = checkpoints.stored(folder, STATE), checkpoints.about_of(shorter)
+    found = checkpoints.stored(folder, STATE)
+    about = checkpoints.about_of(replace(shorter, device=longer.device))
+    groups = list[tuple[int, ...]]()  # of pending seeds that this run can't continue
     for path, own in found.items():
         seeds = tuple(own.pop("seeds", ()))
-        if own == about and pending.issuperset(seeds):
+        if own != about or not pending & set(seeds):
+            continue
+        if not set(longer.asked).issuperset(seeds):
+            groups.append(seeds)
+        else:
             label = checkpoints.about_of(longer) | {"seeds": list(seeds)}
             data = serialization.relabelled(path, label)
             write_bytes(checkpoints.checkpoint_path(longer, seeds), data)
             pending -= set(seeds)
     if pending:
-        _refuse(longer, folder, sorted(pending), bool(found))
+        for own in found.values():
+            if "error" in own:
+                raise own["error"]
+        _refuse(folder, sorted(pending), groups, bool(found))
 
 
-def _plan(folder: Path) -> Plan:
-    """The plan of the run in a folder."""
+def _plan(folder: Path, longer: Plan) -> Plan:
+    """The plan of the run in a folder; its logged data are where `longer` has them."""
     seeds = recorded_seeds(folder, "json")
     if not seeds:
         why = "holds no run; name one such as runs/quick/maze/BC-FQI"
         raise ConfigError("extend", str(folder), why)
     document = read_document(folder, seeds[0])
-    return plan(document["config"], document["env"], document["tag"])
+    try:
+        named = document["env"], document["tag"], longer.config["algorithm"]
+        return recorded(document["config"], *named)
+    except ConfigError as error:
+        raise ConfigError("extend", str(folder), unusable_config(error)) from error
 
 
 def _check(longer: Plan, shorter: Plan, named: str) -> None:
@@ -86,7 +101,8 @@ def _check(longer: Plan, shorter: Plan, named: str) -> None:
     if length is None:
         why = f"ends with {learner.name}; only FQI and DQN go on from a state"
     elif old[0] != new[0]:
-        why = "has other tasks, metrics or stages; only the last stage may be longer"
+        why = "starts from other agents, or has other tasks, metrics or stages; "
+        why += "only the last stage may be longer"
     elif other := [k for k in new[1] if new[1][k] != old[1].get(k) and k != length]:
         key, value = other[0], old[1].get(other[0])
         why = f"has {key}={value}, this run {new[1][key]}; only {length} may differ"
@@ -100,20 +116,30 @@ def _check(longer: Plan, shorter: Plan, named: str) -> None:
 def _parts(plan: Plan) -> tuple[tuple, dict[str, Any]]:
     """What must be equal, and the settings of the last stage's learner."""
     last = plan.stages[-1]
-    whole = plan.tasks, plan.metrics, plan.stages[:-1], type(last.learner)
+    start = identity(plan.config).get("start")
+    whole = start, plan.tasks, plan.metrics, plan.stages[:-1], type(last.learner)
     return (*whole, last.task, last.env, last.transfers, last.before), vars(
         last.learner
     )
 
 
-def _refuse(longer: Plan, folder: Path, seeds: Sequence[int], found: bool) -> None:
-    """Raise ConfigError: no state of these seeds; what they cost if they start anew."""
+def _refuse(
+    folder: Path, seeds: Sequence[int], groups: Sequence[Sequence[int]], found: bool
+) -> None:
+    """Raise ConfigError: no state of these seeds, or of `groups` that have others, too;
+    what they cost if they start anew."""
     spent = [
         records.read_facts(folder, seed).get("cpu_seconds", 0.0)
         for seed in recorded_seeds(folder, "json")
     ]
     why = f"keeps no state of seeds {spelled(seeds)} "
-    why += "(of this version and device)" if found else "(its run had no keep=state)"
+    if groups:
+        why += f"alone: seeds {', and '.join(map(spelled, groups))} were trained "
+        why += "together; name all of a group (seeds=)"
+    elif found:
+        why += "(of this version and device)"
+    else:
+        why += "(its run had no keep=state)"
     cost = max(spent, default=0.0) / 60
     why += f"; without extend= they start anew, for more than {cost:.1f} core-minutes "
     raise ConfigError("extend", str(folder), f"{why}each")

@@ -29,6 +29,8 @@ from bcrl.run import agent_files, checkpoints, extension, locks, records
 from bcrl.run.progress import Tick
 from bcrl.run.schedule import Job
 
+_ALL = ("stages", "state")  # values of `keep` with which agents have all residuals
+
 
 def train(job: Job, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
     """Train those of a job's seeds that are free and write each one's files.
@@ -108,6 +110,16 @@ class _Training:
             self.rows, self.interruptions = json.loads(stored["rows"]), stored["stops"]
             self._began -= stored["spent"]
             log(self.rows)
+            done = [s for s in plan.stages if s.number <= self.run.state.stages]
+            if self._keeps_all and (lost := len(done) - len(self.residuals)) > 0:
+                why = "it was interrupted with another keep=; its agents lack the "
+                say(f"{plan.env} {plan.name}: {why}residuals of {lost} earlier stages")
+
+    @property
+    def _keeps_all(self) -> bool:
+        """Whether agents keep the residuals of all stages, not only the last one's."""
+        config = self.plan.config
+        return config["boosting"]["name"] != "off" or config["keep"] in _ALL
 
     def train(self, tick: Callable[[Tick], None], stop: Stop) -> dict[int, str]:
         """Train to the end or until `stop`; the seeds that failed, and why."""
@@ -132,9 +144,6 @@ class _Training:
                 self._save()
                 saved = time.monotonic()
         failed = self._record(new)
-        if self.plan.config["keep"] == "state" and not failed:
-            self._check_locks()
-            extension.keep(self.plan, self.run, self._content(self.run.ending))
         self._path.unlink(missing_ok=True)
         return failed
 
@@ -150,10 +159,7 @@ class _Training:
         for place, why in self.probe.failed.items():
             self.failed.setdefault(place, f"{why} at {index} {snapshot.count}")
         if snapshot.last_of_stage:
-            config = self.plan.config
-            boosts = config["boosting"]["name"] != "off"
-            every = boosts or config["keep"] in ("stages", "state")
-            earlier = self.residuals if every else []
+            earlier = self.residuals if self._keeps_all else []
             self.residuals = [*earlier, snapshot.result.residual]
 
     def _save(self) -> None:
@@ -175,7 +181,7 @@ class _Training:
 
     def _record(self, new: Sequence[int]) -> dict[int, str]:
         """Write the files of the `new` seeds; those that diverged, and why."""
-        plan, failed = self.plan, {}
+        plan, failed = self.plan, dict[int, str]()
         wall, cpu = map(float, _clocks() - self._began)
         share = cpu / len(self.seeds)  # this seed's
         facts = self.probe.facts() | {"wall_seconds": wall, "cpu_seconds": share}
@@ -183,15 +189,20 @@ class _Training:
         facts |= {"device": plan.device, "success": str(success_of(plan.target))}
         facts |= {"peak_memory_mib": getrusage(RUSAGE_SELF).ru_maxrss / 1024}
         facts |= self.job.origin
+        arrays = [self.probe.arrays(place) for place in range(len(self.seeds))]
+        lost = self.probe.failed | self.failed  # their episodes may fail, too
+        if plan.config["keep"] == "state" and not lost:
+            self._check_locks()  # a complete seed never lacks its state: this is first
+            extension.keep(plan, self.run, self._content(self.run.ending))
         for place, seed in enumerate(self.seeds):
             if seed not in new:
                 continue
-            arrays, status = self.probe.arrays(place), COMPLETE
-            if why := self.failed.get(place) or self.probe.failed.get(place):
+            status = COMPLETE
+            if why := lost.get(place):
                 failed[seed], status = why, f"failed: {why}"
                 say(f"{plan.env} {plan.name}: seed {seed} {status}")
             agent, own = self._agent(place) if seed not in failed else (None, {})
-            found = self.rows[place], arrays, facts | own, agent
+            found = self.rows[place], arrays[place], facts | own, agent
             self._check_locks()
             records.write_seed(plan, seed, status, *found)
         return failed
@@ -206,7 +217,8 @@ class _Training:
             own = stages, self.run.batch, result, self.residuals, place
             return packed(*own), {}
         except TypeError as error:  # of a user's own class
-            return None, {"no_agent": f"{error}: mark the class @storable"}
+            why = "mark the class @storable, and fields with an entry per seed with "
+            return None, {"no_agent": f"{error}: {why}seeds_on (docs/howto/own.md)"}
 
 
 def _clocks() -> np.ndarray:

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from bcrl.common import plugins
 from bcrl.learning.stage import SeedBatch
 from bcrl.learning.transfer import StageInit
-from bcrl.q.functions import ZERO, Shaped, Sum
+from bcrl.q.functions import ZERO, Mapped, Shaped, Sum
 from bcrl.q.regressors import base
 from bcrl.q.regressors.ours import ForestRegressor
 from bcrl.q.regressors.scikit import Sklearn
@@ -63,3 +64,12 @@ def test_a_sum_has_the_values_of_its_terms_bit_for_bit(other, threads, monkeypat
             model = terms[0].models[s][0].model
             assert (model.predict(states[s]) == one[:, 0]).all()
     assert (q(np.stack([states[0]] * 2), 2)[0] == q(states, 2)[0]).all()
+
+
+@pytest.mark.parametrize("stacked", [True, False])
+def test_a_mapped_q_takes_no_states(stacked, monkeypatch):
+    monkeypatch.setenv(plugins.VARIABLE, "tests")
+    q, x = Mapped(Counting(), "tests.toys.doubled"), np.ones((2, 0, 3))
+    assert [v.shape for v in q(x if stacked else [*x], 4)] == [(0, 4)] * 2
+    none, some = q([x[0], np.ones((5, 3))], 4)
+    assert none.shape == (0, 4) and (some == np.full((5, 4), 3.0)).all()

@@ -86,6 +86,12 @@ def about(made: Plan, seed: int) -> dict:
     return json.loads(seed_path(made.directory, seed, "json").read_text())
 
 
+def resealed(path: Path, **entries) -> None:
+    """Change a JSON and its digest."""
+    document = json.loads(path.read_text()) | entries
+    path.write_text(files.sealed(document))
+
+
 def rows(made: Plan, seed: int) -> list[dict[str, float]]:
     """A seed's CSV; an empty cell is NaN."""
     return pd.read_csv(seed_path(made.directory, seed, "csv")).to_dict("records")

@@ -1,17 +1,15 @@
 """Agents that runs leave: their Q and actions after loading, files that are refused."""
 
 import io
-import json
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import bcrl
-from bcrl.common import files, serialization
+from bcrl.common import files, seed_axis, serialization
 from bcrl.common.seeding import stream
 from bcrl.envs import is_finite
 from bcrl.errors import BcrlError
@@ -22,7 +20,7 @@ from bcrl.q.functions import Sum
 from bcrl.q.regressors.base import Fitted
 from bcrl.results.layout import seed_path
 from bcrl.run import agent_files, job
-from tests.run.runs import KINDS, MAZE, about, rows, run
+from tests.run.runs import KINDS, MAZE, SMALL, TABULAR, about, resealed, rows, run
 
 FAST = ("maze BC", "maze C", "car_on_hill BC", "dqn SBC_released", "dqn RPL")
 FAST += ("dqn in gymnasium", "fqi in gymnasium")
@@ -77,6 +75,30 @@ def loaded(made, seed, states):
     played = again(made, agent, rows(made, seed)[-1])
     n = played.length[0, 0]
     return agent.q(states), played.state[0, 0, : n + 1], played.action[0, 0, :n]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("env.id=FrozenLake-v1",),
+        ("env.id=CartPole-v1", "env.observation=tests.toys.doubled"),
+    ],
+)
+def test_agents_of_mapped_and_flattened_observations_are_loaded(words, tmp_path):
+    dqn = "algorithm=dqn", *SMALL, "env.horizon=20", "scale.max_steps=60"
+    more = "algorithm.learning_starts=40", "env.verify=false"
+    made = run(tmp_path, "env=gymnasium", *words, *dqn, *more)
+    agent = bcrl.load(made.directory, 1, trust="tests")
+    npz = np.load(seed_path(made.directory, 1, "npz"))
+    env = agent.make()
+    first, _ = env.reset(seed=3)
+    (state,) = agent.states([first])
+    assert agent.act(first) == agent.q([first]).argmax()
+    if "env.observation" in words[-1]:
+        assert (state == 2.0 * first).all()
+    else:
+        (row,) = np.flatnonzero((npz["states"] == state).all(-1))
+        assert (agent.q([first])[0].astype(np.float32) == npz["q"][row]).all()
 
 
 def again(made, agent, last):
@@ -134,12 +156,6 @@ def test_nothing_is_kept_if_nothing_is_asked_for(tmp_path):
     assert not list(made.directory.glob("*.agent"))
     with pytest.raises(BcrlError, match="keep=none"):
         bcrl.load(made.directory)
-
-
-def resealed(path: Path, **entries) -> None:
-    """Change a JSON and its digest."""
-    document = json.loads(path.read_text()) | entries
-    path.write_text(files.sealed(document))
 
 
 def replaced(made, seed, suffix, data: bytes) -> None:
@@ -226,3 +242,38 @@ def test_a_config_that_names_code_needs_trust(tmp_path):
     resealed(path, config=document["config"] | {"env": env})
     with pytest.raises(BcrlError, match="trust='a_strangers'"):
         bcrl.load(made.directory)
+
+
+def test_what_plays_no_part_in_acting_does_not_prevent_loading(tmp_path):
+    made = run(tmp_path, *TABULAR)
+    path, config = seed_path(made.directory, 0, "json"), about(made, 0)["config"]
+    elsewhere = {"device": "cuda", "logger": {"name": "mine.Lines"}, "workers": -1}
+    older = {k: v for k, v in config.items() if k not in ("keep", "start", "extend")}
+    states = made.target.states()
+    expected = bcrl.load(made.directory, 1).q(states).shape
+    for other in (config | elsewhere, older):
+        resealed(path, config=other)
+        agent = bcrl.load(made.directory, 0)
+        assert agent.q(states).shape == expected and agent.config == other
+    for foreign in ({"env": {}}, {}, [], {**config, "env": {"name": "maze"}}):
+        resealed(path, config=foreign)
+        with pytest.raises(BcrlError, match=str(made.directory)):
+            bcrl.load(made.directory, 0)
+    seed_path(made.directory, 1, "agent").unlink()
+    hashes = about(made, 1)["sha256"]
+    for sha256, why in ((hashes, "was removed"), ({"npz": ""}, "kept none")):
+        resealed(seed_path(made.directory, 1, "json"), sha256=sha256)
+        with pytest.raises(BcrlError, match=f"missing: .*{why}.*keep=final"):
+            bcrl.load(made.directory, 1)
+
+
+def test_a_q_of_other_seeds_is_not_taken_for_theirs(tmp_path):
+    made = run(tmp_path, *TABULAR)
+    documents = {seed: agent_files.document_of(made.directory, seed) for seed in (0, 1)}
+    own = [bcrl.load(made.directory, seed).learned.result.q for seed in (0, 1)]
+    for mixed in ([own[0]] * 2, own[::-1]):
+        with pytest.raises(BcrlError, match=r"seed_000\d\.agent: .*seeds_on"):
+            q = seed_axis.joined(mixed)
+            agent_files.check_recorded(q, made.target, made.directory, documents)
+    q = seed_axis.joined(own)
+    agent_files.check_recorded(q, made.target, made.directory, documents)

@@ -2,11 +2,13 @@
 
 import os
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
 
+import bcrl
 from bcrl.api import Transitions
 from bcrl.common.seeding import stream
 from bcrl.errors import BcrlError, ConfigError
@@ -53,6 +55,44 @@ def test_a_run_from_files_is_byte_identical_to_one_that_collects(collected, tmp_
     assert about(logged, 0)["config"]["algorithm"]["dataset"][0].endswith("1.npz")
     usual = yaml.safe_load((own.directory / "config.yaml").read_text())["algorithm"]
     assert usual["dataset"] == "own" and "dataset_sha256" not in usual
+
+
+def test_runs_with_logged_data_start_from_each_other(collected, tmp_path):
+    one = "algorithm.iterations=2", "env.tasks.mass=[0.8]"
+    data, elsewhere = tmp_path / "1.npz", tmp_path / "elsewhere.npz"
+    first = run(tmp_path / "first", *SHORT, *one, f"algorithm.dataset={data}")
+    data.rename(elsewhere)  # neither its agents nor what starts from them need it
+    assert bcrl.load(first.directory).learned.residuals
+    two = "algorithm.iterations=2", "env.tasks.mass=[1.0,1.2]", "variant=BC"
+    words = (*SHORT, *two, f"start.from={first.directory}")
+    expected = run(tmp_path / "two", *words, listed(tmp_path, "2.npz", "3.npz"))
+    every = [*collected[1:], collected[0]]  # tasks 1 and 2 are this run's own
+    parts = [
+        replace(part, episode=None, task=np.full(len(part.reward), number))
+        for number, part in enumerate(every, start=1)
+    ]
+    arrays = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name, value in vars(parts[0]).items()
+        if value is not None
+    }
+    whole = Transitions(**arrays).save(tmp_path / "whole.npz")
+    made = run(tmp_path / "one", *words, f"algorithm.dataset={whole}")
+    assert results(made, 1) == results(expected, 1)
+
+
+def test_a_run_with_moved_data_is_extended(collected, tmp_path):
+    data, words = tmp_path / "3.npz", (*SHORT, "seeds.count=1", "env.tasks.mass=[1.2]")
+    words = (*words, "scale.max_iterations=9")
+    short, long = "algorithm.iterations=2", "algorithm.iterations=4"
+    first = run(
+        tmp_path / "a", *words, short, f"algorithm.dataset={data}", "keep=state"
+    )
+    moved = data.rename(tmp_path / "moved.npz")
+    words = (*words, long, f"algorithm.dataset={moved}")
+    calm = run(tmp_path / "calm", *words)
+    longer = run(tmp_path / "b", *words, f"extend={first.directory}")
+    assert results(calm, 0) == results(longer, 0)
 
 
 def test_moved_files_are_the_same_run_and_changed_ones_another(collected, tmp_path):

@@ -48,14 +48,17 @@ class _Settings:
 def stages(section: Plain, chosen: Composition) -> tuple[Stage, ...]:
     """One stage per slot."""
     learners = []
+    if "dataset" not in section and (known := section.get("dataset_sha256")):
+        section = section | {"dataset": known}  # a recorded run's data, not read again
     each = per_slot(section, _PER_SLOT, len(chosen.order))
     for values, task in zip(each, chosen.order, strict=True):
         own: _Settings = construct("algorithm", _Settings, values)
         env, data, episodes = chosen.tasks[task], None, own.episodes
         if own.dataset not in COLLECTED:
             data = LoggedFile(own.dataset, own.dataset_sha256)
-            rows = len(transitions_of(data, task + 1, env).reward)
-            episodes = math.ceil(rows / env.horizon)  # as many, for what they cost
+            if data.is_named:
+                rows = len(transitions_of(data, task + 1, env).reward)
+                episodes = math.ceil(rows / env.horizon)  # as many, for what they cost
         every = own.evaluate_every
         if every is None:
             every = interval(env, own.iterations, episodes)
