@@ -5,6 +5,7 @@ few rows and columns is summed up over a list of terms. The order of a sum is th
 list's, whatever the processor: a float depends neither on others nor on the tile.
 """
 
+from collections.abc import Callable
 from itertools import chain
 
 from llvmlite import ir
@@ -96,7 +97,11 @@ def multiply(out, columns, rows, n_rows, terms, n_terms, a, across, along, right
                 _narrow(out, rows, *place, terms, n_terms, *factors)
 
 
-@intrinsic
+#: A function that builds LLVM code for calls of itself.
+_instructions: Callable[[Callable], Callable] = intrinsic
+
+
+@_instructions
 def turn(typing, slopes, units, turned, row, column):
     """Zero a square of slopes where their units are off, and write it transposed."""
 
