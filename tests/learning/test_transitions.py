@@ -47,7 +47,7 @@ def measured(frame):
 
 
 @pytest.mark.parametrize("tasks", [TASKS, LISTED], ids=["continuous", "finite"])
-@pytest.mark.parametrize("transfer", [warm_start, Boost(), Shape()], ids=str)
+@pytest.mark.parametrize("transfer", [warm_start, Boost(), Shape()], ids="CBS")
 def test_logged_data_that_fqi_would_collect_give_equal_numbers(
     tasks, transfer, tmp_path
 ):
