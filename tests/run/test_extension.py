@@ -1,4 +1,4 @@
-"""A longer run goes on from the end of a shorter one, as if it had never stopped."""
+"""A longer run continues from the end of a shorter one, as if it had never stopped."""
 
 import signal
 from dataclasses import replace
