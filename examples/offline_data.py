@@ -34,14 +34,11 @@ tasks = [
 logs = [logged(g, steps=4000, seed=0) for g in gravities]
 settings = {"iterations": 25, "evaluate_every": 25, "regressor": Forest(trees=30)}
 learners = [FQI(dataset=log, **settings) for log in logs]
-methods = {
-    "B-FQI": stages(tasks[-1:] * 2, learners[-1], Boost()),
-    "BC-FQI": stages(tasks, learners, Boost()),
-}
-frames = {
-    name: run(each, seeds=range(2), progress=False) for name, each in methods.items()
-}
-results = pd.concat(frames, names=["method", "row"])
+methods = [
+    stages(tasks[-1:] * 2, learners[-1], Boost()),  # B-FQI
+    stages(tasks, learners, Boost()),  # BC-FQI
+]
+results = pd.concat(run(each, seeds=range(2), progress=False) for each in methods)
 
 last = results.groupby(["method", "seed"]).tail(1)
 print(last.groupby("method")[["return", "solved"]].mean().round(3))

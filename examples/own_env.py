@@ -46,15 +46,12 @@ class SwingUp:
 tasks = [SwingUp(torque=torque) for torque in (8.0, 6.0, 4.0, 3.0)]
 settings = {"iterations": 15, "evaluate_every": 15, "episodes": 100, "epsilon": 0.3}
 learner = FQI(**settings, regressor=Forest(trees=20))
-methods = {
-    "FQI": stages(tasks[-1:] * 4, learner),
-    "C-FQI": stages(tasks, learner),
-    "BC-FQI": stages(tasks, learner, Boost()),
-}
-frames = {
-    name: run(each, seeds=range(3), progress=False) for name, each in methods.items()
-}
-results = pd.concat(frames, names=["method", "row"])
+methods = [
+    stages(tasks[-1:] * 4, learner),  # FQI
+    stages(tasks, learner),  # C-FQI
+    stages(tasks, learner, Boost()),  # BC-FQI
+]
+results = pd.concat(run(each, seeds=range(3), progress=False) for each in methods)
 
 last = results[results.iteration == results.iteration.max()]
 print(last.groupby("method")[["return", "solved"]].mean().round(2))
