@@ -17,10 +17,10 @@ from bcrl.report.figures.curves import figure_metrics
 from bcrl.report.figures.layout import TEXT, inches
 from bcrl.report.figures.sweep import figure_final, figure_map, figure_sweep
 from bcrl.report.load import load_chosen
-from bcrl.report.sweeps import sweeps_of
+from bcrl.report.sweeps import Sweep, sweeps_of
 from bcrl.report.variants import Methods, Runs
 from bcrl.results.layout import seed_path
-from tests.report.runs import as_claimed, report, write_dqn, write_fqi
+from tests.report.runs import as_claimed, in_memory, report, write_dqn, write_fqi
 from tests.results.made_up import made_up_plan, reseal, write_seeds
 
 TAGGED = ("FQI", "BC-FQI", "BC-FQI@a", "BC-FQI@b")
@@ -302,3 +302,12 @@ def test_one_diverging_method_is_cut_off_and_a_success_is_not(tmp_path):
     axes = figure_metrics(runs, methods, ["return"], COLUMN).axes[0]
     assert axes.get_ylim()[0] > -200
     assert "cut: C-FQI diverges" in {text.get_text() for text in axes.texts}
+
+
+def test_equal_seeds_have_a_final_value_without_an_interval():
+    """The mean of 30 such values is a bit apart from each of them."""
+    returns = {"return": np.full((30, 1), -46.90944570448864)}
+    both = {(n,): in_memory(f"maze/FQI@{n}", returns) for n in (1, 2)}
+    sweep = Sweep("FQI", ("algorithm.episodes",), both)
+    axes = figure_final(Runs("smoke", ()), [sweep], "return", COLUMN).axes[0]
+    assert axes.lines[0].get_ydata() == pytest.approx(returns["return"][:2, 0])

@@ -89,7 +89,8 @@ def figure_final(
         ends = [variant.final(metric) for variant in sweep.variants.values()]
         mean = np.array([each.mean() for each in ends])
         low, high = np.transpose([bootstrap(each) for each in ends])
-        error = np.nan_to_num(np.stack([mean - low, high - mean]))
+        # Equal values: rounding can put the mean just outside its interval.
+        error = np.maximum(0, np.nan_to_num(np.stack([mean - low, high - mean])))
         axes.errorbar(x, mean, error, capsize=2.0, elinewidth=0.8, **lines[sweep.label])
     if numeric and _by_decades(values):
         axes.set_xscale("log")
