@@ -112,8 +112,8 @@ def _hashable(value: Any) -> Any:
 
 
 def text_of(value: Any) -> str:
-    """A value as a label: `0.001`, `none`."""
-    return f"{value:g}" if is_numeric([value]) else as_text(value)
+    """A value as a label, another for each: `0.001`, `1000000`, `none`."""
+    return str(value).removesuffix(".0") if is_numeric([value]) else as_text(value)
 
 
 def is_numeric(values: Sequence[Any]) -> bool:

@@ -14,6 +14,7 @@ from bcrl.errors import BcrlError
 from bcrl.report.choose import folders_of, labelled
 from bcrl.report.figures import style
 from bcrl.report.figures.curves import figure_metrics
+from bcrl.report.figures.frames import figure_frame
 from bcrl.report.figures.layout import TEXT, inches
 from bcrl.report.figures.sweep import figure_final, figure_map, figure_sweep
 from bcrl.report.load import load_chosen
@@ -302,6 +303,20 @@ def test_one_diverging_method_is_cut_off_and_a_success_is_not(tmp_path):
     axes = figure_metrics(runs, methods, ["return"], COLUMN).axes[0]
     assert axes.get_ylim()[0] > -200
     assert "cut: C-FQI diverges" in {text.get_text() for text in axes.texts}
+
+
+def test_values_that_differ_little_have_labels_of_their_own():
+    values = [0.001, 1000000, 1234567, 1234568.0, 1e20, 0.1 + 0.2]
+    texts = ["0.001", "1000000", "1234567", "1234568", "1e+20", "0.30000000000000004"]
+    made = {
+        (v,): in_memory(f"maze/FQI@{v}", {"return": np.ones((2, 1))}) for v in values
+    }
+    sweep = Sweep("FQI", ("algorithm.episodes",), made)
+    assert [*sweep.methods] == texts
+    frame = pd.DataFrame({"learner.x": values, "return": 0.5})
+    frame = frame.assign(method="FQI", seed=0, stage=1, task=1, iteration=1)
+    labels = legend_of(figure_frame(frame, "return"))
+    assert labels == [f"FQI x={text}" for text in texts]
 
 
 def test_equal_seeds_have_a_final_value_without_an_interval():

@@ -37,7 +37,7 @@ def _mark_decades(axis: Axis, values: Sequence[Any]) -> None:
     """Plain numbers on a logarithmic axis: `1 2 5 10`, or `1 10` if these are many."""
     few = max(values) < _MANY * min(values)
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
-    axis.set_major_formatter(lambda x, _: text_of(x))
+    axis.set_major_formatter(lambda x, _: f"{x:.12g}")
     axis.set_minor_formatter(NullFormatter())
 
 
