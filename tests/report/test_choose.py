@@ -114,6 +114,8 @@ def test_every_method_has_a_look_of_its_own_without_colours():
     assert len({(x["linestyle"], x["marker"]) for x in looks.values()}) == len(names)
     assert {looks[name]["color"] for name in names[-5:]} == {style.colour("BC-FQI")}
     assert style.lines_of(["BC-FQI"])["BC-FQI"] == looks["BC-FQI"]
+    labels = ["RPL@a", "RPL (maze)", "RPL, steps=5", "RPL"]
+    assert {style.colour(label) for label in labels} == {looks["RPL"]["color"]}
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The look that all figures share: colours, dashes, markers, task bands, cut axes."""
 
 import itertools
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -51,8 +52,9 @@ def sheet() -> AbstractContextManager[None]:
 
 
 def _prefix(name: str) -> str:
-    """What LOOKS has of a method or variant: `BC` of `BC-FQI@ep100`, `RPL` of `RPL`."""
-    method = name.partition("@")[0].partition(" ")[0]
+    """What LOOKS has of a method or a label: `BC` of `BC-FQI@a (maze)` and `BC-FQI, a=1`,
+    `RPL` of `RPL`."""
+    method = re.split("[@ ,]", name, maxsplit=1)[0]
     prefix = method if method in LOOKS else method.rpartition("-")[0]
     return prefix if prefix in LOOKS else "PPR"
 
