@@ -16,11 +16,12 @@ from bcrl.report.figures.curves import figure_metrics, metrics_of
 from bcrl.report.figures.layout import Print, save_figure
 from bcrl.report.figures.sweep import figure_final, figure_map, figure_sweep
 from bcrl.report.load import load_chosen
-from bcrl.report.sweeps import sweeps_of
+from bcrl.report.sweeps import another, sweeps_of
 from bcrl.report.variants import Methods, Runs, Variant
 from bcrl.results.layout import recorded_seeds
 
 _KEYS = 2  # that one figure can sweep
+_LONGEST = 120  # characters of a file's name, about
 Named = Iterator[tuple[str, Figure]]  # figures and the ends of their files' names
 
 
@@ -38,11 +39,18 @@ def draw_chosen(options: Namespace, out: Path, how: Print) -> list[Path]:
     kind = "sweep" if options.sweep else "compare"
     stem = options.name or f"{kind}_{envs}_{runs.scale.replace(' and ', '+')}"
     draw = _sweep_figures if options.sweep else _compared
-    files: list[Path] = []
+    files, names = list[Path](), list[str]()
     for end, figure in draw(runs, methods, metrics, how.width, options):
-        name = re.sub(r"[^\w.@=+-]+", "-", f"{stem}_{end}")
-        files += save_figure(figure, out, name, f"{envs}: {end}", how)
+        names.append(another(_file_name(f"{stem}_{end}"), names))
+        files += save_figure(figure, out, names[-1], f"{envs}: {end}", how)
     return files
+
+
+def _file_name(text: str) -> str:
+    """A text as a file's name, without the middle of a long one."""
+    name = re.sub(r"[^\w.@=+-]+", "-", text)
+    half = _LONGEST // 2
+    return name if len(name) <= _LONGEST else f"{name[:half]}-{name[-half:]}"
 
 
 def folders_of(

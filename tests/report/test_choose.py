@@ -307,6 +307,26 @@ def test_one_diverging_method_is_cut_off_and_a_success_is_not(tmp_path):
     assert "cut: C-FQI diverges" in {text.get_text() for text in axes.texts}
 
 
+def test_sweeps_have_different_labels_and_short_file_names(tmp_path, capsys):
+    """Of two keys with the same end, and of long lists with the same begin."""
+    for tag in range(8):
+        on = {"name": "on" if tag // 2 % 2 else "off"}
+        env = {"metrics": ["return"], "tasks": {"x": [0.5] * 20 + [tag // 4]}}
+        config = {"algorithm": {"name": "fqi", "episodes": tag % 2}, "boosting": on}
+        config |= {"curriculum": on, "env": {"name": "mine"} | env}
+        plan = made_up_plan(tmp_path, "mine", f"FQI@{tag}", range(1), config=config)
+        rows = {"stage": 1, "task": 1, "iteration": [1], "return": [tag]}
+        write_seeds(plan, lambda seed, rows=rows: pd.DataFrame(rows))
+    words = ["--sweep", "algorithm.episodes", "--format", "svg", "--name", "n" * 100]
+    assert report(tmp_path, *words) == 0
+    names = [Path(line).name for line in capsys.readouterr().out.split()]
+    assert len(set(names)) == 5 and max(map(len, names)) < 130
+    variants = chosen(tmp_path, "*")[1].values()
+    labels = [s.label for s in sweeps_of([*variants], ["algorithm.episodes"])]
+    assert len(set(labels)) == 4 and max(map(len, labels)) < 120
+    assert all("boosting.name=o" in x and "curriculum.name=o" in x for x in labels)
+
+
 def test_values_that_differ_little_have_labels_of_their_own():
     values = [0.001, 1000000, 1234567, 1234568.0, 1e20, 0.1 + 0.2]
     texts = ["0.001", "1000000", "1234567", "1234568", "1e+20", "0.30000000000000004"]

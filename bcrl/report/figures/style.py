@@ -52,8 +52,8 @@ def sheet() -> AbstractContextManager[None]:
 
 
 def _prefix(name: str) -> str:
-    """What LOOKS has of a method or a label: `BC` of `BC-FQI@a (maze)` and `BC-FQI, a=1`,
-    `RPL` of `RPL`."""
+    """What LOOKS has of a method or a label: `BC` of `BC-FQI@ep100` and of
+    `BC-FQI, loss=l1`, `RPL` of `RPL`."""
     method = re.split("[@ ,]", name, maxsplit=1)[0]
     prefix = method if method in LOOKS else method.rpartition("-")[0]
     return prefix if prefix in LOOKS else "PPR"
