@@ -1,7 +1,7 @@
 """What is reported on: variants' seeds as arrays, and what is odd about them."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -186,21 +186,24 @@ def tags_shown(methods: Methods) -> str:
 def remarks(runs: Runs, methods: Methods, compares: bool = True) -> list[str]:
     """The lines that belong under a figure of `methods`, which may be of several tags.
     `compares`: differences between methods belong to it too."""
-    env, family = next((v.env, v.family) for v in methods.values())
+    family = next(v.family for v in methods.values())
     tags = {v.tag for v in methods.values()}
-    drawn = {(v.method, v.tag) for v in methods.values()}
+    drawn = {(v.env, v.method, v.tag) for v in methods.values()}
+    envs = list(dict.fromkeys(v.env for v in methods.values()))
 
     def belongs(note: Note) -> bool:
-        if (note.method, note.tag) in drawn:
+        if (note.env, note.method, note.tag) in drawn:
             return True
         if note.method:  # it isn't drawn: perhaps it has no complete seed
-            awaited = note.method in COMPARED.get((env, family), ())
+            awaited = note.method in COMPARED.get((note.env, family), ())
             return compares and note.incomplete and awaited and note.tag in tags
         return compares and note.family == family and {note.tag} == tags
 
-    shown = [note for note in runs.notes if note.env == env and belongs(note)]
+    shown = [note for note in runs.notes if note.env in envs and belongs(note)]
+    if len(envs) > 1:
+        shown = [replace(n, footer=n.footer and f"{n.env} {n.footer}") for n in shown]
     if compares and not any(note.family for note in shown):  # as of a mixture of tags
-        shown += across_methods(methods, methods, env, None, family)
+        shown += across_methods(methods, methods, listed(envs), None, family)
     odd = "; ".join(n.footer for n in shown if n.footer and not n.incomplete)
     return list(filter(None, [incomplete(shown), odd and f"Note: {odd}"]))
 

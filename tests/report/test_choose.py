@@ -192,6 +192,22 @@ def test_two_counters_are_not_drawn_in_one_figure(written, capsys):
     assert "iterations" in capsys.readouterr().err
 
 
+def test_figures_across_environments_have_all_remarks_and_no_ones_optimum(tmp_path):
+    write_fqi(tmp_path, "maze", seeds=2, methods=("FQI",))
+    write_fqi(tmp_path, "car_on_hill", seeds=2, methods=("FQI", "BC-FQI"))
+    reseal(seed_path(tmp_path / "smoke/car_on_hill/FQI", 1, "json"), status="running")
+    folders = [str(tmp_path / "smoke" / x) for x in ("maze/FQI", "car_on_hill/FQI")]
+    runs = load_chosen([*map(Path, folders)], allow_incomplete=True)
+    methods = labelled(runs.variants)
+    figure = figure_metrics(runs, methods, ["return"], COLUMN)
+    assert "INCOMPLETE: car_on_hill FQI 1 of 2 seeds" in figure.get_label()
+    assert legend_of(figure) == [*methods]
+    alone = dict([*methods.items()][:1])
+    figure = figure_metrics(runs, alone, ["return"], COLUMN)
+    assert legend_of(figure)[-1] == "optimum of the target"
+    assert "INCOMPLETE" not in figure.get_label()
+
+
 def test_a_caption_of_its_own_file_leaves_what_is_incomplete_in_the_figure(
     tmp_path, capsys
 ):

@@ -35,9 +35,9 @@ def _wrapped(text: str) -> str:
 
 
 def optimum_of(methods: Methods) -> float | None:
-    """The target's optimum if the methods agree on one."""
-    optima = {v.optimum for v in methods.values()} - {None}
-    return optima.pop() if len(optima) == 1 else None
+    """The target's optimum if the methods are of one environment and agree on it."""
+    found = {(v.env, v.optimum) for v in methods.values()}
+    return found.pop()[1] if len(found) == 1 else None
 
 
 def all_rows(variant: Variant) -> np.ndarray:
