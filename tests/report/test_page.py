@@ -102,8 +102,17 @@ def test_tasks_are_shaded_where_the_curricula_agree(tmp_path):
 
 def test_a_task_is_shaded_over_iterations_without_a_row():
     task, index = np.array([1, 1, 2]), np.array([9, 25, 50])
-    rare = SimpleNamespace(family="FQI", task=task, index=index)
+    rare = SimpleNamespace(family="FQI", stage=task, task=task, index=index)
     assert task_spans(rare) == [("T1", 0.5, 25.5), ("T2", 25.5, 50.5)]
+
+
+@pytest.mark.parametrize(
+    ("index", "begin"), [([35, 40, 50], 30.5), ([31], 30.5), ([35, 80], 0.5)]
+)
+def test_a_task_after_another_runs_begins_with_its_own_iterations(index, begin):
+    task = np.full(len(index), 4)
+    later = SimpleNamespace(family="FQI", stage=task, task=task, index=np.array(index))
+    assert task_spans(later) == [("T4", begin, index[-1] + 0.5)]
 
 
 def test_long_curves_keep_their_stages_ends(tmp_path):

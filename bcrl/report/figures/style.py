@@ -94,7 +94,10 @@ def task_spans(variant: Variant) -> list[Span]:
     if variant.family == "DQN":  # a stage begins with a row
         edges = np.append(index, index[-1]).astype(float)
     else:  # and here it ends with one; not every iteration has a row
-        edges = np.append(0, index) + 0.5
+        between = int(index[1] - index[0]) if len(index) > 1 else 1
+        # Another run's stages, from which this one starts, come first.
+        begin = max(0, index[0] - between) if variant.stage[0] > 1 else 0
+        edges = np.append(begin, index) + 0.5
     spans = itertools.pairwise([0, *np.flatnonzero(np.diff(task)) + 1, len(task)])
     return [(f"T{task[a]}", edges[a].item(), edges[b].item()) for a, b in spans]
 
