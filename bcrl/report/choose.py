@@ -68,12 +68,13 @@ def folders_of(
         else:
             there = _folders(place)
             found += [place / each for each in there if fnmatchcase(each, name)]
-    return list(dict.fromkeys(path.resolve() for path in found))
+    # A link to a variant keeps its name, which the method and the tag are read from.
+    return list(dict.fromkeys(Path(os.path.abspath(path)) for path in found))
 
 
 def _variant_folder(path: Path) -> Path:
     """The folder if it has seeds; else BcrlError."""
-    if recorded_seeds(path.resolve(), "json"):
+    if recorded_seeds(path, "json"):
         return path
     why = "has no seed_*.json" if path.is_dir() else "is not a folder"
     form = "RUNS_DIR/SCALE/ENV/VARIANT"

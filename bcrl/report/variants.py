@@ -174,7 +174,11 @@ def listed(items: Iterable[object]) -> str:
 
 def tags_shown(methods: Methods) -> str:
     """`variants @released`, or whose: `@released: BC-DQN, SC-DQN`."""
-    tagged = {name: v.tag for name, v in methods.items() if v.tag and v.tag not in name}
+    tagged = {
+        name: v.tag
+        for name, v in methods.items()
+        if v.tag and not name.partition(" ")[0].endswith(f"@{v.tag}")
+    }
     if len(set(tagged.values())) > 1:
         return ""
     (tag,) = set(tagged.values()) or {""}

@@ -1,6 +1,7 @@
 """`bcrl-report --compare` and `--sweep`: figures of any runs, on made-up ones."""
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from bcrl.report.figures.layout import TEXT, inches
 from bcrl.report.figures.sweep import figure_final, figure_map, figure_sweep
 from bcrl.report.load import load_chosen
 from bcrl.report.sweeps import Sweep, sweeps_of
-from bcrl.report.variants import Methods, Runs
+from bcrl.report.variants import Methods, Runs, tags_shown
 from bcrl.results.layout import seed_path
 from tests.report.runs import as_claimed, in_memory, report, write_dqn, write_fqi
 from tests.results.made_up import made_up_plan, reseal, write_seeds
@@ -143,6 +144,25 @@ def test_runs_of_any_folder_can_be_compared(written, tmp_path):
     figure = figure_metrics(runs, methods, ["q_error"], COLUMN)
     (first, second), note = methods, figure.get_label()
     assert f"seeds differ: 0–1: {first}; 0–2: {second}" in note
+
+
+def test_a_linked_variant_is_read_by_its_own_name(written, tmp_path, monkeypatch):
+    stored, link = tmp_path / "stored/1", tmp_path / "linked/smoke/maze/BC-FQI@a"
+    shutil.copytree(written / "smoke/maze/BC-FQI@a", stored)
+    link.parent.mkdir(parents=True)
+    link.symlink_to(stored)
+    monkeypatch.chdir(tmp_path)
+    for name in ("linked/smoke/maze/BC-FQI@a", "./linked/smoke/../smoke/maze/BC-FQI@a"):
+        (variant,) = chosen(written, name)[1].values()
+        assert (variant.folder, variant.tag) == (link, "a")
+
+
+def test_a_tag_is_told_unless_a_label_ends_with_it():
+    runs = {"return": np.ones((1, 1))}
+    bare, whole = in_memory("maze/FQI@Q", runs), in_memory("maze/BC-FQI@Q", runs)
+    assert tags_shown({"FQI": bare}) == "variants @Q"
+    assert tags_shown({"FQI": bare, "BC-FQI@Q (quick)": whole}) == "@Q: FQI"
+    assert tags_shown({"BC-FQI@Q": whole}) == ""
 
 
 def test_patterns_name_several_variants_once(written):
