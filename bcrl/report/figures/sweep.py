@@ -120,7 +120,8 @@ def figure_map(runs: Runs, sweep: Sweep, metric: str, width: float) -> Figure:
     shown = {str(at): np.array([cells[at]]) for at in np.ndindex(cells.shape)}
     far = style.strays(metric, {n: v for n, v in shown.items() if np.isfinite(v).all()})
     within = np.concatenate([v for name, v in shown.items() if name not in far])
-    limits = {"vmin": np.nanmin(within), "vmax": np.nanmax(within)}
+    within = within[np.isfinite(within)]
+    limits = {"vmin": within.min(), "vmax": within.max()} if len(within) else {}
     image = axes.imshow(cells, cmap=_COLOURS, origin="lower", aspect="auto", **limits)
     if len(columns) <= _WRITTEN:
         _write(axes, cells, image.norm)
@@ -128,8 +129,11 @@ def figure_map(runs: Runs, sweep: Sweep, metric: str, width: float) -> Figure:
     axes.set_yticks(range(len(rows)), map(text_of, rows))
     axes.set(xlabel=sweep.keys[0], ylabel=sweep.keys[1])
     family = next(iter(sweep.variants.values())).family
-    bar = style.colour_bar(axes, image, shrink=1.0, aspect=25)
-    bar.set_label(curves.label(family, metric))
+    label = curves.label(family, metric)
+    if limits:
+        style.colour_bar(axes, image, shrink=1.0, aspect=25).set_label(label)
+    else:
+        axes.set_title(f"{label}: no values")
     what = f"{sweep.label}, {_ENDS[family]}, mean over seeds"
     return layout.caption(figure, runs, sweep.methods, what)
 
