@@ -14,6 +14,7 @@ from bcrl.common.terminal import say
 from bcrl.errors import BcrlError, closest, did_you_mean
 from bcrl.report.figures.curves import figure_metrics, metrics_of
 from bcrl.report.figures.layout import Print, save_figure
+from bcrl.report.figures.style import lines_of
 from bcrl.report.figures.sweep import figure_final, figure_map, figure_sweep
 from bcrl.report.load import load_chosen
 from bcrl.report.sweeps import another, sweeps_of
@@ -149,10 +150,14 @@ def _chosen_metrics(methods: Methods, names: Sequence[str] | None) -> list[str]:
 def _compared(
     runs: Runs, methods: Methods, metrics: list[str], width: float, options: Namespace
 ) -> Named:
-    """One figure per metric with the curves of all variants that record it."""
+    """One figure per metric with the curves of all variants that record it; a variant
+    looks alike in all."""
+    lines = lines_of(methods)
     for metric in metrics:
         shown = {name: v for name, v in methods.items() if metric in v.metrics}
-        yield metric, figure_metrics(runs, shown, [metric], width, options.target_only)
+        look = {name: lines[name] for name in shown}
+        figure = figure_metrics(runs, shown, [metric], width, options.target_only, look)
+        yield metric, figure
 
 
 def _sweep_figures(

@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from bcrl.errors import BcrlError
-from bcrl.report.choose import folders_of, labelled
+from bcrl.report.choose import _compared, folders_of, labelled
 from bcrl.report.figures import style
 from bcrl.report.figures.curves import figure_metrics
 from bcrl.report.figures.frames import figure_frame
@@ -375,6 +376,36 @@ def test_values_that_differ_little_have_labels_of_their_own():
     frame = frame.assign(method="FQI", seed=0, stage=1, task=1, iteration=1)
     labels = legend_of(figure_frame(frame, "return"))
     assert labels == [f"FQI x={text}" for text in texts]
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_map_without_values_has_no_colour_bar():
+    nothing = {"loss": np.full((2, 1), np.nan)}
+    cells = {(x, y): in_memory(f"maze/FQI@{x}{y}", nothing) for x in "ab" for y in "cd"}
+    figure = figure_map(
+        Runs("smoke", ()), Sweep("FQI", ("k", "l"), cells), "loss", TEXT
+    )
+    figure.draw_without_rendering()
+    assert len(figure.axes) == 1
+    assert {text.get_text() for text in figure.axes[0].texts} == {"–"}
+
+
+def test_a_variant_looks_alike_in_the_figures_of_all_metrics():
+    """Also where one of the others lacks a metric."""
+    drawn = {"return": np.ones((1, 2)), "solved": np.ones((1, 2))}
+    some = {"a": {"return": drawn["return"]}, "b": drawn, "c": drawn}
+    methods = {f"FQI@{x}": in_memory(f"maze/FQI@{x}", m) for x, m in some.items()}
+    how = Namespace(target_only=False)
+    runs = Runs("smoke", (*methods.values(),))
+    figures = dict(_compared(runs, methods, ["return", "solved"], TEXT, how))
+
+    def looks(lines) -> list[tuple]:
+        marked = [line for line in lines if line.get_marker() != "None"]
+        return [(x.get_marker(), x._unscaled_dash_pattern) for x in marked]
+
+    first, second = (looks(figure.axes[0].lines) for figure in figures.values())
+    assert first[1:] == second and len({*first}) == 3
+    assert looks(figures["solved"].legends[0].legend_handles) == second
 
 
 def test_equal_seeds_have_a_final_value_without_an_interval():
