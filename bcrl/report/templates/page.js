@@ -179,7 +179,7 @@
     /** Places of a series' points that are to be drawn. */
     places(series) {
       const all = series.x.map((_, i) => i);
-      return this.state.target ? all.filter((i) => series.task[i] === series.task.at(-1)) : all;
+      return this.state.target ? all.filter((i) => series.task[i] === series.target) : all;
     }
 
     get domain() {
