@@ -14,13 +14,15 @@ from bcrl.common.terminal import say
 from bcrl.errors import BcrlError, closest, did_you_mean
 from bcrl.report.figures.curves import figure_metrics, metrics_of
 from bcrl.report.figures.layout import Print, save_figure
+from bcrl.report.figures.style import lines_of
 from bcrl.report.figures.sweep import figure_final, figure_map, figure_sweep
 from bcrl.report.load import load_chosen
-from bcrl.report.sweeps import sweeps_of
+from bcrl.report.sweeps import another, sweeps_of
 from bcrl.report.variants import Methods, Runs, Variant
 from bcrl.results.layout import recorded_seeds
 
 _KEYS = 2  # that one figure can sweep
+_LONGEST = 120  # characters of a file's name, about
 Named = Iterator[tuple[str, Figure]]  # figures and the ends of their files' names
 
 
@@ -38,11 +40,18 @@ def draw_chosen(options: Namespace, out: Path, how: Print) -> list[Path]:
     kind = "sweep" if options.sweep else "compare"
     stem = options.name or f"{kind}_{envs}_{runs.scale.replace(' and ', '+')}"
     draw = _sweep_figures if options.sweep else _compared
-    files: list[Path] = []
+    files, names = list[Path](), list[str]()
     for end, figure in draw(runs, methods, metrics, how.width, options):
-        name = re.sub(r"[^\w.@=+-]+", "-", f"{stem}_{end}")
-        files += save_figure(figure, out, name, f"{envs}: {end}", how)
+        names.append(another(_file_name(f"{stem}_{end}"), names))
+        files += save_figure(figure, out, names[-1], f"{envs}: {end}", how)
     return files
+
+
+def _file_name(text: str) -> str:
+    """A text as a file's name, without the middle of a long one."""
+    name = re.sub(r"[^\w.@=+-]+", "-", text)
+    half = _LONGEST // 2
+    return name if len(name) <= _LONGEST else f"{name[:half]}-{name[-half:]}"
 
 
 def folders_of(
@@ -60,12 +69,13 @@ def folders_of(
         else:
             there = _folders(place)
             found += [place / each for each in there if fnmatchcase(each, name)]
-    return list(dict.fromkeys(path.resolve() for path in found))
+    # A link to a variant keeps its name, which the method and the tag are read from.
+    return list(dict.fromkeys(Path(os.path.abspath(path)) for path in found))
 
 
 def _variant_folder(path: Path) -> Path:
     """The folder if it has seeds; else BcrlError."""
-    if recorded_seeds(path.resolve(), "json"):
+    if recorded_seeds(path, "json"):
         return path
     why = "has no seed_*.json" if path.is_dir() else "is not a folder"
     form = "RUNS_DIR/SCALE/ENV/VARIANT"
@@ -140,10 +150,14 @@ def _chosen_metrics(methods: Methods, names: Sequence[str] | None) -> list[str]:
 def _compared(
     runs: Runs, methods: Methods, metrics: list[str], width: float, options: Namespace
 ) -> Named:
-    """One figure per metric with the curves of all variants that record it."""
+    """One figure per metric with the curves of all variants that record it; a variant
+    looks alike in all."""
+    lines = lines_of(methods)
     for metric in metrics:
         shown = {name: v for name, v in methods.items() if metric in v.metrics}
-        yield metric, figure_metrics(runs, shown, [metric], width, options.target_only)
+        look = {name: lines[name] for name in shown}
+        figure = figure_metrics(runs, shown, [metric], width, options.target_only, look)
+        yield metric, figure
 
 
 def _sweep_figures(

@@ -32,7 +32,7 @@ def curve_data(runs: Runs, env: str, family: str, tag: str | None) -> dict[str, 
         "spans": curves.shared_spans(ours),
         # A family that counts steps records undiscounted returns.
         "optimum": curves.optimum_of(found) if family == "FQI" else None,
-        "courses": any(v.task[0] != v.task[-1] for v in found.values()),
+        "courses": any((v.task != v.target).any() for v in found.values()),
         "target": family == "DQN",
         "metrics": metrics,
         "labels": {metric: curves.label(family, metric) for metric in metrics},
@@ -68,6 +68,7 @@ def _series(variant: Variant, metrics: list[str], line: style.Line) -> dict[str,
         "dash": " ".join(f"{_STROKE * each:g}" for each in dashes),
         "x": variant.index[rows].tolist(),
         "task": variant.task[rows].tolist(),
+        "target": variant.target,
         "metrics": drawn,
     }
 

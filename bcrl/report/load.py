@@ -44,15 +44,16 @@ def load_runs(runs_dir: Path, scale: str, allow_incomplete: bool = False) -> Run
 
 
 def load_chosen(folders: Sequence[Path], allow_incomplete: bool = False) -> Runs:
-    """The variants of some folders of any scales and environments, in this order."""
-    checked = [check_folder(folder.resolve()) for folder in folders]
+    """The variants of some folders, given as absolute paths, of any scales and
+    environments, in this order."""
+    checked = [check_folder(folder) for folder in folders]
     findings = [finding for each in checked for finding in each.findings]
-    _reject(findings, folders[0].resolve().parents[2], "", allow_incomplete)
+    _reject(findings, folders[0].parents[2], "", allow_incomplete)
     notes: list[Note] = []
     variants = tuple(filter(None, [_variant(each, notes) for each in checked]))
     if not variants:
         raise BcrlError("; ".join(["no complete runs", *(note.text for note in notes)]))
-    scales = dict.fromkeys(folder.resolve().parts[-3] for folder in folders)
+    scales = dict.fromkeys(folder.parts[-3] for folder in folders)
     return Runs(listed(scales), variants, notes)
 
 

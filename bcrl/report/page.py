@@ -21,6 +21,7 @@ from bcrl.report.curve_data import curve_data
 from bcrl.report.tables import GLOSSARY, PARAGRAPHS, TASKS, Section, TextTable
 from bcrl.report.variants import Pair, Runs, Variant, env_title, incomplete
 from bcrl.results.layout import seed_path, spelled
+from bcrl.results.tasks import numbered_tasks
 
 Picture = tuple[Path, str]  # an image file and what it shows
 #: The page's cards of claims: title → verdict → its word after a number.
@@ -79,20 +80,22 @@ def _facts(runs: Runs, claims: Mapping[Pair, Section]) -> dict[str, object]:
     return facts
 
 
-def task_values(variants: Iterable[Variant]) -> dict[tuple[str, ...], str]:
-    """Each task's values as text → the variants that have these tasks."""
-    found: dict[tuple[str, ...], list[str]] = {}
+def task_values(variants: Iterable[Variant]) -> dict[tuple[tuple[str, str], ...], str]:
+    """Each task's number and values as text → the variants that have these tasks."""
+    found: dict[tuple[tuple[str, str], ...], list[str]] = {}
     for variant in variants:
-        varied = variant.config["env"].get("tasks") or {}
-        lists = {name: values for name, values in varied.items() if values is not None}
+        tasks, target = numbered_tasks(variant.config)
         texts = []
-        for values in zip(*lists.values(), strict=True):
-            task = flat(dict(zip(lists, values, strict=True)))
+        for n, task in enumerate(tasks, start=1):
             # A simulator's attributes and arguments go by their own names.
-            each = (f"{k.rpartition('.')[2]} {as_text(v)}" for k, v in task.items())
-            texts.append(", ".join(each))
+            own = flat(task.values).items()
+            each = [f"{k.rpartition('.')[2]} {as_text(v)}" for k, v in own]
+            env = task.constants["name"]
+            each = [env] * (env != tasks[target - 1].constants["name"]) + each
+            texts.append((f"T{n}{', target' * (n == target)}", ", ".join(each)))
         found.setdefault(tuple(texts), []).append(variant.name)
-    return {tasks: ", ".join(names) for tasks, names in found.items() if tasks}
+    given = {tasks: names for tasks, names in found.items() if any(t for _, t in tasks)}
+    return {tasks: ", ".join(names) for tasks, names in given.items()}
 
 
 def costs(runs: Runs) -> list[str | TextTable]:

@@ -1,8 +1,9 @@
 """Sweeps: variants of a method that differ in one or two chosen keys only."""
 
+import itertools
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,7 @@ from bcrl.errors import BcrlError, did_you_mean
 from bcrl.report.variants import Methods, Variant, listed
 
 SweptValues = tuple[Any, ...]  # a value per swept key
+_LONGEST = 30  # characters of a value in a sweep's label
 
 
 @dataclass(frozen=True)
@@ -86,17 +88,39 @@ def _nothing(variants: Sequence[Variant], keys: Sequence[str]) -> str:
 
 
 def _labels(groups: Sequence[tuple[str, str]]) -> list[str]:
-    """Each group's method, with the settings that differ from others of the method."""
-    found = []
+    """Each group's method, with the settings that differ from others of the method:
+    long values cut, equal labels numbered."""
+    found: list[str] = []
     for method, rest in groups:
         mine = json.loads(rest)
         others = [json.loads(text) for name, text in groups if name == method]
-        told = {
-            key.rpartition(".")[2]: text_of(value)
-            for key, value in mine.items()
-            if any(other.get(key) != value for other in others)
+        keys = {key for other in others for key in other}
+        differing = {
+            k for k in keys if any(o.get(k) != others[0].get(k) for o in others)
         }
-        found.append(", ".join([method, *(f"{k}={v}" for k, v in told.items())]))
+        names = _short(differing)
+        texts = {names[k]: text_of(v) for k, v in mine.items() if k in differing}
+        told = (
+            f"{k}={v[:_LONGEST]}{'…' * (len(v) > _LONGEST)}" for k, v in texts.items()
+        )
+        found.append(another(", ".join([method, *told]), found))
+    return found
+
+
+def another(text: str, taken: Collection[str]) -> str:
+    """The text, with a number if it is taken: `a-2`, `a-3`."""
+    numbered = (f"{text}-{n}" for n in itertools.count(2))
+    return next(t for t in itertools.chain([text], numbered) if t not in taken)
+
+
+def _short(keys: Collection[str]) -> dict[str, str]:
+    """Each key's shortest end that no other key has: `loss`, but `boosting.name`."""
+    found = {}
+    for key in keys:
+        parts = key.split(".")
+        ends = [".".join(parts[-n:]) for n in range(1, len(parts))]
+        own = (e for e in ends if sum(f".{k}".endswith(f".{e}") for k in keys) == 1)
+        found[key] = next(own, key)
     return found
 
 
@@ -112,8 +136,8 @@ def _hashable(value: Any) -> Any:
 
 
 def text_of(value: Any) -> str:
-    """A value as a label: `0.001`, `none`."""
-    return f"{value:g}" if is_numeric([value]) else as_text(value)
+    """A value as a label, another for each: `0.001`, `1000000`, `none`."""
+    return str(value).removesuffix(".0") if is_numeric([value]) else as_text(value)
 
 
 def is_numeric(values: Sequence[Any]) -> bool:

@@ -1,7 +1,7 @@
 """What is reported on: variants' seeds as arrays, and what is odd about them."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from bcrl.common.divergence import diverging
 from bcrl.results.layout import seed_path, spelled
 from bcrl.results.outcomes import late_rows
 from bcrl.results.read import read_arrays
+from bcrl.results.tasks import target_of
 
 LINEAR = "linear_system"
 #: The methods of each family, in the order of the legends.
@@ -47,11 +48,11 @@ class Note:
 @dataclass(eq=False)
 class Variant:
     """All complete seeds of one variant: S seeds, I rows (evaluations) common to them.
-    `stage` and `task` (I,) are 1-based; `index` (I,) counts the iterations or, in the
-    DQN family, the environment steps of all stages so far; `metrics` are (S, I), those
-    that diverge are `far`; `sidecars` are the seeds' JSONs, of which the first has the
-    `config`; `failed` are seeds that diverged and are left out. The folder's `name` is
-    the `method` and perhaps its `tag`: `BC-FQI@released`."""
+    `stage`, `task` (I,) and the number of the `target` are 1-based; `index` (I,) counts
+    the iterations or, in the DQN family, the environment steps of all stages so far;
+    `metrics` are (S, I), those that diverge are `far`; `sidecars` are the seeds' JSONs,
+    of which the first has the `config`; `failed` are seeds that diverged and are left
+    out. The folder's `name` is the `method` and perhaps its `tag`: `FQI@released`."""
 
     folder: Path
     family: str
@@ -68,6 +69,7 @@ class Variant:
         self.method, _, tag = self.name.partition("@")
         self.tag = tag or None
         self.far, self.config = diverging(self.metrics), self.sidecars[0]["config"]
+        self.target = target_of(self.config, self.task)
 
     @property
     def optimum(self) -> float | None:
@@ -82,8 +84,8 @@ class Variant:
 
     @property
     def target_rows(self) -> np.ndarray:
-        """Rows that were measured in the target, which is the last task, (T,)."""
-        return np.flatnonzero(self.task == self.task[-1])
+        """Rows that were measured in the target, (T,)."""
+        return np.flatnonzero(self.task == self.target)
 
     def last(self, metric: str) -> np.ndarray:
         """A metric at the last evaluation, (S,)."""
@@ -91,17 +93,17 @@ class Variant:
 
     @property
     def late_rows(self) -> np.ndarray:
-        """Rows of the target in a run's last WINDOW environment steps, (L,)."""
-        return late_rows(self.task, self.index)
+        """Rows of the target in its last WINDOW environment steps, (L,)."""
+        return late_rows(self.target_rows, self.index)
 
     def late(self, metric: str) -> np.ndarray:
         """Every seed's mean over the `late_rows`, (S,)."""
         return self.metrics[metric][:, self.late_rows].mean(axis=1)
 
     def final(self, metric: str) -> np.ndarray:
-        """What a run ends with, (S,): the last value or, in the DQN family, a mean over
-        the `late_rows` that have one; nan where there is none."""
-        rows = self.late_rows if self.family == "DQN" else [-1]
+        """What a run ends with in the target, (S,): the last value or, in the DQN
+        family, a mean over the `late_rows` that have one; nan where there is none."""
+        rows = self.late_rows if self.family == "DQN" else self.target_rows[-1:]
         values = np.ma.masked_invalid(self.metrics[metric][:, rows])
         return np.asarray(values.mean(axis=1).filled(np.nan))
 
@@ -174,7 +176,11 @@ def listed(items: Iterable[object]) -> str:
 
 def tags_shown(methods: Methods) -> str:
     """`variants @released`, or whose: `@released: BC-DQN, SC-DQN`."""
-    tagged = {name: v.tag for name, v in methods.items() if v.tag and v.tag not in name}
+    tagged = {
+        name: v.tag
+        for name, v in methods.items()
+        if v.tag and not name.partition(" ")[0].endswith(f"@{v.tag}")
+    }
     if len(set(tagged.values())) > 1:
         return ""
     (tag,) = set(tagged.values()) or {""}
@@ -186,21 +192,24 @@ def tags_shown(methods: Methods) -> str:
 def remarks(runs: Runs, methods: Methods, compares: bool = True) -> list[str]:
     """The lines that belong under a figure of `methods`, which may be of several tags.
     `compares`: differences between methods belong to it too."""
-    env, family = next((v.env, v.family) for v in methods.values())
+    family = next(v.family for v in methods.values())
     tags = {v.tag for v in methods.values()}
-    drawn = {(v.method, v.tag) for v in methods.values()}
+    drawn = {(v.env, v.method, v.tag) for v in methods.values()}
+    envs = list(dict.fromkeys(v.env for v in methods.values()))
 
     def belongs(note: Note) -> bool:
-        if (note.method, note.tag) in drawn:
+        if (note.env, note.method, note.tag) in drawn:
             return True
         if note.method:  # it isn't drawn: perhaps it has no complete seed
-            awaited = note.method in COMPARED.get((env, family), ())
+            awaited = note.method in COMPARED.get((note.env, family), ())
             return compares and note.incomplete and awaited and note.tag in tags
         return compares and note.family == family and {note.tag} == tags
 
-    shown = [note for note in runs.notes if note.env == env and belongs(note)]
+    shown = [note for note in runs.notes if note.env in envs and belongs(note)]
+    if len(envs) > 1:
+        shown = [replace(n, footer=n.footer and f"{n.env} {n.footer}") for n in shown]
     if compares and not any(note.family for note in shown):  # as of a mixture of tags
-        shown += across_methods(methods, methods, env, None, family)
+        shown += across_methods(methods, methods, listed(envs), None, family)
     odd = "; ".join(n.footer for n in shown if n.footer and not n.incomplete)
     return list(filter(None, [incomplete(shown), odd and f"Note: {odd}"]))
 

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from bcrl.results import layout
 from bcrl.results.read import read_document, read_recorded
+from bcrl.results.tasks import target_of
 
-WINDOW = 5000  # environment steps before a run's end whose evaluations are averaged
+WINDOW = 5000  # environment steps before the target's end with averaged evaluations
 
 
 class Outcome(NamedTuple):
@@ -22,15 +23,17 @@ class Outcome(NamedTuple):
     cpu_seconds: float
 
 
-def late_rows(task: NDArray, index: NDArray) -> NDArray[np.intp]:
-    """Rows of the target, which is the last task, in the last WINDOW steps, (T,)."""
-    return np.flatnonzero((task == task[-1]) & (index > index[-1] - WINDOW))
+def late_rows(target_rows: NDArray[np.intp], index: NDArray) -> NDArray[np.intp]:
+    """Those of the target's rows that are in its last WINDOW steps, which are also the
+    run's last ones unless its curriculum ends with another task, (L,)."""
+    steps = index[target_rows]
+    return target_rows[steps > steps[-1] - WINDOW]
 
 
 def outcome(folder: Path, seed: int) -> Outcome | None:
-    """What a seed ended with: after fitted Q-iteration (FQI) at the last evaluation, in
-    the DQN family on average over `late_rows`. None for a seed that is not complete;
-    Finding if its files are not what the run recorded."""
+    """What a seed ended with in the target: after fitted Q-iteration (FQI) at the last
+    evaluation, in the DQN family on average over `late_rows`. None for a seed that is
+    not complete; Finding if its files are not what the run recorded."""
     document = read_document(folder, seed)
     if layout.state_of(document) != layout.COMPLETE:
         return None
@@ -38,11 +41,12 @@ def outcome(folder: Path, seed: int) -> Outcome | None:
     header, *rows = csv.reader(data.decode().splitlines())
     table = np.array([[float(x or "nan") for x in row] for row in rows])
     columns = dict(zip(header, table.T, strict=True))
+    task = columns["task"]
+    chosen = np.flatnonzero(task == target_of(document["config"], task))
     if layout.family_of(columns) == "FQI":
-        chosen, success = np.array([-1]), "solved"
+        chosen, success = chosen[-1:], "solved"
     else:
-        chosen = late_rows(columns["task"], columns["step"])
-        success = "success_rate"
+        chosen, success = late_rows(chosen, columns["step"]), "success_rate"
     nothing = np.full(len(table), math.nan)
     ends = [columns.get(x, nothing)[chosen].mean() for x in ("return", success)]
     cpu = float(document.get("cpu_seconds") or 0.0)

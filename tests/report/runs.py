@@ -8,7 +8,7 @@ import pandas as pd
 
 from bcrl.report import cli
 from bcrl.report.claims import claims_report, claims_sections
-from bcrl.report.variants import COMPARED, METHODS, Runs
+from bcrl.report.variants import COMPARED, METHODS, Runs, Variant
 from bcrl.results.layout import DQN_METRICS, seed_path
 from tests.results.made_up import made_up_plan, write_seeds
 
@@ -21,6 +21,18 @@ LEVEL = {"DQN": -100, "C-DQN": -120, "BC-DQN": -80, "SC-DQN": -60, "SBC-DQN": -4
 LEVEL |= {"RPL": -110, "PPR": -105, "S-DQN": -100}
 ACTIONS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], float)
 PLANE = np.array([(x, 0, y, 0) for x in range(-20, 21) for y in range(-20, 21)]) / 4
+
+
+def in_memory(
+    place: str, metrics: dict[str, np.ndarray], config=None, task=None, **facts
+) -> Variant:
+    """A variant `maze/FQI@tag` without files; `metrics` are (S, I), rows iterations."""
+    n_seeds, n_rows = next(iter(metrics.values())).shape
+    task = np.ones(n_rows, int) if task is None else np.array(task)
+    rows = np.unique(task, return_inverse=True)[1] + 1, task, np.arange(n_rows) + 1
+    sidecars = tuple(facts | {"config": config or {"env": {}}} for _ in range(n_seeds))
+    folder = Path("/runs/smoke") / place
+    return Variant(folder, "FQI", tuple(range(n_seeds)), *rows, metrics, sidecars)
 
 
 def report(runs_dir: Path, *arguments: str) -> int:

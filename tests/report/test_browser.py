@@ -207,6 +207,9 @@ def test_seeds_median_and_zoom(page):
     page.press(f"{RETURN} svg", "+")
     shown = page.texts(f"{RETURN} text")
     assert "T5" in shown and "T1" not in shown
+    page.press(f"{RETURN} svg", "+" * 60)  # no closer than one iteration
+    texts = page.texts(f"{RETURN} text")
+    assert len({*texts}) == len(texts) and len(texts) < 20
     page.press(f"{RETURN} svg", "\ue00c")  # Escape
     assert "T1" in page.texts(f"{RETURN} text")
 

@@ -1,6 +1,8 @@
 """`bcrl-report --compare` and `--sweep`: figures of any runs, on made-up ones."""
 
 import re
+import shutil
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +13,17 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from bcrl.errors import BcrlError
-from bcrl.report.choose import folders_of, labelled
+from bcrl.report.choose import _compared, folders_of, labelled
 from bcrl.report.figures import style
 from bcrl.report.figures.curves import figure_metrics
+from bcrl.report.figures.frames import figure_frame
 from bcrl.report.figures.layout import TEXT, inches
 from bcrl.report.figures.sweep import figure_final, figure_map, figure_sweep
 from bcrl.report.load import load_chosen
-from bcrl.report.sweeps import sweeps_of
-from bcrl.report.variants import Methods, Runs
+from bcrl.report.sweeps import Sweep, sweeps_of
+from bcrl.report.variants import Methods, Runs, tags_shown
 from bcrl.results.layout import seed_path
-from tests.report.runs import as_claimed, report, write_dqn, write_fqi
+from tests.report.runs import as_claimed, in_memory, report, write_dqn, write_fqi
 from tests.results.made_up import made_up_plan, reseal, write_seeds
 
 TAGGED = ("FQI", "BC-FQI", "BC-FQI@a", "BC-FQI@b")
@@ -113,6 +116,8 @@ def test_every_method_has_a_look_of_its_own_without_colours():
     assert len({(x["linestyle"], x["marker"]) for x in looks.values()}) == len(names)
     assert {looks[name]["color"] for name in names[-5:]} == {style.colour("BC-FQI")}
     assert style.lines_of(["BC-FQI"])["BC-FQI"] == looks["BC-FQI"]
+    labels = ["RPL@a", "RPL (maze)", "RPL, steps=5", "RPL"]
+    assert {style.colour(label) for label in labels} == {looks["RPL"]["color"]}
 
 
 @pytest.mark.parametrize(
@@ -140,6 +145,25 @@ def test_runs_of_any_folder_can_be_compared(written, tmp_path):
     figure = figure_metrics(runs, methods, ["q_error"], COLUMN)
     (first, second), note = methods, figure.get_label()
     assert f"seeds differ: 0–1: {first}; 0–2: {second}" in note
+
+
+def test_a_linked_variant_is_read_by_its_own_name(written, tmp_path, monkeypatch):
+    stored, link = tmp_path / "stored/1", tmp_path / "linked/smoke/maze/BC-FQI@a"
+    shutil.copytree(written / "smoke/maze/BC-FQI@a", stored)
+    link.parent.mkdir(parents=True)
+    link.symlink_to(stored)
+    monkeypatch.chdir(tmp_path)
+    for name in ("linked/smoke/maze/BC-FQI@a", "./linked/smoke/../smoke/maze/BC-FQI@a"):
+        (variant,) = chosen(written, name)[1].values()
+        assert (variant.folder, variant.tag) == (link, "a")
+
+
+def test_a_tag_is_told_unless_a_label_ends_with_it():
+    runs = {"return": np.ones((1, 1))}
+    bare, whole = in_memory("maze/FQI@Q", runs), in_memory("maze/BC-FQI@Q", runs)
+    assert tags_shown({"FQI": bare}) == "variants @Q"
+    assert tags_shown({"FQI": bare, "BC-FQI@Q (quick)": whole}) == "@Q: FQI"
+    assert tags_shown({"BC-FQI@Q": whole}) == ""
 
 
 def test_patterns_name_several_variants_once(written):
@@ -187,6 +211,22 @@ def test_two_counters_are_not_drawn_in_one_figure(written, capsys):
     paths = [str(written / "smoke/maze/FQI"), str(written / "smoke/linear_system/DQN")]
     assert report(written, "--compare", *paths) == 2
     assert "iterations" in capsys.readouterr().err
+
+
+def test_figures_across_environments_have_all_remarks_and_no_ones_optimum(tmp_path):
+    write_fqi(tmp_path, "maze", seeds=2, methods=("FQI",))
+    write_fqi(tmp_path, "car_on_hill", seeds=2, methods=("FQI", "BC-FQI"))
+    reseal(seed_path(tmp_path / "smoke/car_on_hill/FQI", 1, "json"), status="running")
+    folders = [str(tmp_path / "smoke" / x) for x in ("maze/FQI", "car_on_hill/FQI")]
+    runs = load_chosen([*map(Path, folders)], allow_incomplete=True)
+    methods = labelled(runs.variants)
+    figure = figure_metrics(runs, methods, ["return"], COLUMN)
+    assert "INCOMPLETE: car_on_hill FQI 1 of 2 seeds" in figure.get_label()
+    assert legend_of(figure) == [*methods]
+    alone = dict([*methods.items()][:1])
+    figure = figure_metrics(runs, alone, ["return"], COLUMN)
+    assert legend_of(figure)[-1] == "optimum of the target"
+    assert "INCOMPLETE" not in figure.get_label()
 
 
 def test_a_caption_of_its_own_file_leaves_what_is_incomplete_in_the_figure(
@@ -302,3 +342,76 @@ def test_one_diverging_method_is_cut_off_and_a_success_is_not(tmp_path):
     axes = figure_metrics(runs, methods, ["return"], COLUMN).axes[0]
     assert axes.get_ylim()[0] > -200
     assert "cut: C-FQI diverges" in {text.get_text() for text in axes.texts}
+
+
+def test_sweeps_have_different_labels_and_short_file_names(tmp_path, capsys):
+    """Of two keys with the same end, and of long lists with the same begin."""
+    for tag in range(8):
+        on = {"name": "on" if tag // 2 % 2 else "off"}
+        env = {"metrics": ["return"], "tasks": {"x": [0.5] * 20 + [tag // 4]}}
+        config = {"algorithm": {"name": "fqi", "episodes": tag % 2}, "boosting": on}
+        config |= {"curriculum": on, "env": {"name": "mine"} | env}
+        plan = made_up_plan(tmp_path, "mine", f"FQI@{tag}", range(1), config=config)
+        rows = {"stage": 1, "task": 1, "iteration": [1], "return": [tag]}
+        write_seeds(plan, lambda seed, rows=rows: pd.DataFrame(rows))
+    words = ["--sweep", "algorithm.episodes", "--format", "svg", "--name", "n" * 100]
+    assert report(tmp_path, *words) == 0
+    names = [Path(line).name for line in capsys.readouterr().out.split()]
+    assert len(set(names)) == 5 and max(map(len, names)) < 130
+    variants = chosen(tmp_path, "*")[1].values()
+    labels = [s.label for s in sweeps_of([*variants], ["algorithm.episodes"])]
+    assert len(set(labels)) == 4 and max(map(len, labels)) < 120
+    assert all("boosting.name=o" in x and "curriculum.name=o" in x for x in labels)
+
+
+def test_values_that_differ_little_have_labels_of_their_own():
+    values = [0.001, 1000000, 1234567, 1234568.0, 1e20, 0.1 + 0.2]
+    texts = ["0.001", "1000000", "1234567", "1234568", "1e+20", "0.30000000000000004"]
+    made = {
+        (v,): in_memory(f"maze/FQI@{v}", {"return": np.ones((2, 1))}) for v in values
+    }
+    sweep = Sweep("FQI", ("algorithm.episodes",), made)
+    assert [*sweep.methods] == texts
+    frame = pd.DataFrame({"learner.x": values, "return": 0.5})
+    frame = frame.assign(method="FQI", seed=0, stage=1, task=1, iteration=1)
+    labels = legend_of(figure_frame(frame, "return"))
+    assert labels == [f"FQI x={text}" for text in texts]
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_map_without_values_has_no_colour_bar():
+    nothing = {"loss": np.full((2, 1), np.nan)}
+    cells = {(x, y): in_memory(f"maze/FQI@{x}{y}", nothing) for x in "ab" for y in "cd"}
+    figure = figure_map(
+        Runs("smoke", ()), Sweep("FQI", ("k", "l"), cells), "loss", TEXT
+    )
+    figure.draw_without_rendering()
+    assert len(figure.axes) == 1
+    assert {text.get_text() for text in figure.axes[0].texts} == {"–"}
+
+
+def test_a_variant_looks_alike_in_the_figures_of_all_metrics():
+    """Also where one of the others lacks a metric."""
+    drawn = {"return": np.ones((1, 2)), "solved": np.ones((1, 2))}
+    some = {"a": {"return": drawn["return"]}, "b": drawn, "c": drawn}
+    methods = {f"FQI@{x}": in_memory(f"maze/FQI@{x}", m) for x, m in some.items()}
+    how = Namespace(target_only=False)
+    runs = Runs("smoke", (*methods.values(),))
+    figures = dict(_compared(runs, methods, ["return", "solved"], TEXT, how))
+
+    def looks(lines) -> list[tuple]:
+        marked = [line for line in lines if line.get_marker() != "None"]
+        return [(x.get_marker(), x._unscaled_dash_pattern) for x in marked]
+
+    first, second = (looks(figure.axes[0].lines) for figure in figures.values())
+    assert first[1:] == second and len({*first}) == 3
+    assert looks(figures["solved"].legends[0].legend_handles) == second
+
+
+def test_equal_seeds_have_a_final_value_without_an_interval():
+    """The mean of 30 such values is a bit apart from each of them."""
+    returns = {"return": np.full((30, 1), -46.90944570448864)}
+    both = {(n,): in_memory(f"maze/FQI@{n}", returns) for n in (1, 2)}
+    sweep = Sweep("FQI", ("algorithm.episodes",), both)
+    axes = figure_final(Runs("smoke", ()), [sweep], "return", COLUMN).axes[0]
+    assert axes.lines[0].get_ydata() == pytest.approx(returns["return"][:2, 0])

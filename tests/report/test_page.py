@@ -20,7 +20,7 @@ from bcrl.report.figures.style import task_spans
 from bcrl.report.load import load_runs
 from bcrl.report.page import task_values
 from bcrl.results.layout import DQN_METRICS
-from tests.report.runs import report, write_dqn, write_fqi
+from tests.report.runs import in_memory, report, write_dqn, write_fqi
 from tests.results.made_up import made_up_plan, write_seeds
 
 OWN = "my_<i>env"  # folders can be called so
@@ -102,8 +102,17 @@ def test_tasks_are_shaded_where_the_curricula_agree(tmp_path):
 
 def test_a_task_is_shaded_over_iterations_without_a_row():
     task, index = np.array([1, 1, 2]), np.array([9, 25, 50])
-    rare = SimpleNamespace(family="FQI", task=task, index=index)
+    rare = SimpleNamespace(family="FQI", stage=task, task=task, index=index)
     assert task_spans(rare) == [("T1", 0.5, 25.5), ("T2", 25.5, 50.5)]
+
+
+@pytest.mark.parametrize(
+    ("index", "begin"), [([35, 40, 50], 30.5), ([31], 30.5), ([35, 80], 0.5)]
+)
+def test_a_task_after_another_runs_begins_with_its_own_iterations(index, begin):
+    task = np.full(len(index), 4)
+    later = SimpleNamespace(family="FQI", stage=task, task=task, index=np.array(index))
+    assert task_spans(later) == [("T4", begin, index[-1] + 0.5)]
 
 
 def test_long_curves_keep_their_stages_ends(tmp_path):
@@ -169,8 +178,8 @@ def test_what_nobody_asked_for_is_not_missed(tmp_path, capsys):
         write_seeds(plan, lambda seed, table=table: table)
     variants = load_runs(tmp_path, "smoke").of("mine", "FQI")
     assert task_values(variants) == {
-        ("force 0.2", "force 0.1"): "FQI, B-FQI",
-        ("mass 2",): "C-FQI",
+        (("T1", "force 0.2"), ("T2, target", "force 0.1")): "FQI, B-FQI",
+        (("T1, target", "mass 2"),): "C-FQI",
     }
     assert report(tmp_path) == 0
     assert "figure" not in capsys.readouterr().err
@@ -180,6 +189,35 @@ def test_what_nobody_asked_for_is_not_missed(tmp_path, capsys):
     assert "<dt>T2, target</dt><dd>force 0.1</dd>" in page
     assert report(tmp_path, "--figures", "1") == 0
     assert "skipped figure 1: no runs of car_on_hill" in capsys.readouterr().err
+
+
+def test_tasks_of_the_run_that_another_starts_from_come_first():
+    """As in the CSVs; a task of both has one number, another environment its name."""
+
+    def config(name: str, forces: list | None, source=None) -> dict:
+        start = {"start": {"run": {"env": name, "tag": None, "config": source}}}
+        env = {"name": name, "gamma": 0.9, "tasks": {"force": forces, "mass": None}}
+        return {"env": env} | (start if source else {})
+
+    def listed(config: dict) -> list[tuple[str, str]]:
+        made = in_memory("cart/FQI", {"return": np.ones((1, 1))}, config=config)
+        return [task for tasks in task_values([made]) for task in tasks]
+
+    first = config("cart", [3, 2])
+    second = config("cart", [2, 1], first)
+    assert listed(second) == [
+        ("T1", "force 3"),
+        ("T2", "force 2"),
+        ("T3, target", "force 1"),
+    ]
+    assert listed(config("cart", [3], second))[0] == ("T1, target", "force 3")
+    other = listed(config("pole", [2], first))
+    assert other == [
+        ("T1", "cart, force 3"),
+        ("T2", "cart, force 2"),
+        ("T3, target", "force 2"),
+    ]
+    assert listed(config("cart", None)) == []
 
 
 def test_animations_have_a_still_picture(reported):

@@ -6,6 +6,7 @@ import pytest
 import bcrl
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.results import verify
+from bcrl.results.tasks import numbered_tasks
 from tests.conftest import plan
 from tests.run.runs import DQN, HILL, MAZE, compared, rows, run
 
@@ -69,6 +70,8 @@ def test_a_third_run_starts_from_the_second(tmp_path):
     )
     made = [row for p in (first, second, third) for row in rows(p, 0)]
     assert made == rows(whole, 0)
+    tasks, target = numbered_tasks(third.config)
+    assert [task.values["mass"] for task in tasks] == [0.8, 1.0, 1.2] and target == 3
     first.directory.rename(tmp_path / "elsewhere")
     assert len(bcrl.load(third.directory).residuals) == 1
 

@@ -10,8 +10,9 @@ import pytest
 from bcrl.config import tags
 from bcrl.report import cli as report
 from bcrl.report.choose import folders_of
-from bcrl.report.load import load_runs
+from bcrl.report.load import load_chosen, load_runs
 from bcrl.report.tables import sweep_table
+from bcrl.results.layout import DQN_METRICS
 from bcrl.results.outcomes import outcome
 from bcrl.run import runner, status
 from bcrl.run.summary import summary
@@ -53,6 +54,28 @@ def test_few_seeds_are_listed_and_of_more_there_is_an_interval(tmp_path):
     seeds, returns, success, cpu = cells(text, many.directory)
     assert (seeds, success, cpu) == ("6 of 6", "50%", "3.0 h")
     assert returns.startswith("2.500 [") and "95 %" in text.splitlines()[0]
+
+
+def test_a_curriculum_that_ends_elsewhere_is_judged_by_its_target(tmp_path):
+    """The last of the config's tasks; DQN's window ends with its last evaluation."""
+    env = {"name": "mine", "metrics": ["return"], "tasks": {"mass": [1.0, 2.0]}}
+    rows = {"stage": [1, 2, 3], "task": [1, 2, 1], "iteration": [1, 2, 3]}
+    step = np.arange(0, 30_000, 1000)
+    steps = {
+        "stage": 1 + step // 10_000,
+        "task": np.repeat([1, 2, 1], 10),
+        "step": step,
+    }
+    steps |= dict.fromkeys(DQN_METRICS, step / 1000)
+    for name, table, end in (
+        ("FQI", rows | {"return": [-1.0, -2.0, -3.0]}, -2.0),
+        ("DQN", steps, np.mean([15, 16, 17, 18, 19])),
+    ):
+        made = made_up_plan(tmp_path, "mine", name, range(2), config={"env": env})
+        write_seeds(made, lambda seed, table=table: pd.DataFrame(table))
+        assert outcome(made.directory, 0).returned == end
+        (variant,) = load_chosen([made.directory]).variants
+        assert variant.final("return").tolist() == [end, end]
 
 
 def test_the_end_and_the_report_show_the_same_late_returns(tmp_path):

@@ -35,9 +35,9 @@ def _wrapped(text: str) -> str:
 
 
 def optimum_of(methods: Methods) -> float | None:
-    """The target's optimum if the methods agree on one."""
-    optima = {v.optimum for v in methods.values()} - {None}
-    return optima.pop() if len(optima) == 1 else None
+    """The target's optimum if the methods are of one environment and agree on it."""
+    found = {(v.env, v.optimum) for v in methods.values()}
+    return found.pop()[1] if len(found) == 1 else None
 
 
 def all_rows(variant: Variant) -> np.ndarray:
@@ -153,15 +153,18 @@ def figure_metrics(
     metrics: Sequence[str],
     width: float,
     target_only: bool = False,
+    lines: Mapping[str, style.Line] | None = None,
 ) -> Figure:
-    """One panel per metric, with a curve and its interval for each of any variants."""
-    figure, found, shaded = draw_metrics(methods, metrics, width, target_only)
+    """One panel per metric, with a curve and its interval for each of any variants.
+    `lines`: other looks."""
+    figure, found, shaded = draw_metrics(methods, metrics, width, target_only, lines)
     fqi = all(variant.family == "FQI" for variant in methods.values())
     optimum = optimum_of(methods) if fqi and "return" in metrics else None
     if optimum is not None:
         found[metrics.index("return")].axhline(optimum, **style.OPTIMUM)
     known = optimum is not None
-    return layout.finish(figure, runs, methods, BAND + shaded, optimum=known)
+    what = BAND + shaded
+    return layout.finish(figure, runs, methods, what, optimum=known, lines=lines)
 
 
 def figure_curves(

@@ -63,7 +63,7 @@ def _methods(frame: pd.DataFrame, metric: str) -> Methods:
 
 def _text(value: object) -> str:
     """A setting's value; in a column with defaults, whole numbers are floats."""
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return str(value).removesuffix(".0" if isinstance(value, float) else "")
 
 
 def _variant_of(rows: pd.DataFrame, metric: str, family: str, label: str) -> Variant:

@@ -2,7 +2,7 @@
 
 import math
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -128,9 +128,11 @@ def finish(
     what: str,
     optimum: bool = False,
     compares: bool = True,
+    lines: Mapping[str, Line] | None = None,
 ) -> Figure:
-    """The figure with a legend of the methods and a `caption`."""
-    entries = [*lines_of(methods).items()]
+    """The figure with a legend of the methods, which may have other looks, `lines`, and
+    a `caption`."""
+    entries = [*(lines or lines_of(methods)).items()]
     legend(figure, entries + [("optimum of the target", OPTIMUM)] * optimum)
     return caption(figure, runs, methods, what, compares)
 

@@ -22,7 +22,7 @@ _SMALL = style.SMALL | {"fontsize": style.LABEL}
 
 def _pretraining_rows(variant: Variant) -> np.ndarray:
     """Rows of a first stage on another task than the target; may be none, (P,)."""
-    return np.flatnonzero((variant.stage == 1) & (variant.task != variant.task[-1]))
+    return np.flatnonzero((variant.stage == 1) & (variant.task != variant.target))
 
 
 def pretraining(methods: Methods) -> dict[str, Variant]:

@@ -1,6 +1,7 @@
 """The look that all figures share: colours, dashes, markers, task bands, cut axes."""
 
 import itertools
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -51,8 +52,9 @@ def sheet() -> AbstractContextManager[None]:
 
 
 def _prefix(name: str) -> str:
-    """What LOOKS has of a method or variant: `BC` of `BC-FQI@ep100`, `RPL` of `RPL`."""
-    method = name.partition("@")[0].partition(" ")[0]
+    """What LOOKS has of a method or a label: `BC` of `BC-FQI@ep100` and of
+    `BC-FQI, loss=l1`, `RPL` of `RPL`."""
+    method = re.split("[@ ,]", name, maxsplit=1)[0]
     prefix = method if method in LOOKS else method.rpartition("-")[0]
     return prefix if prefix in LOOKS else "PPR"
 
@@ -92,7 +94,10 @@ def task_spans(variant: Variant) -> list[Span]:
     if variant.family == "DQN":  # a stage begins with a row
         edges = np.append(index, index[-1]).astype(float)
     else:  # and here it ends with one; not every iteration has a row
-        edges = np.append(0, index) + 0.5
+        between = int(index[1] - index[0]) if len(index) > 1 else 1
+        # Another run's stages, from which this one starts, come first.
+        begin = max(0, index[0] - between) if variant.stage[0] > 1 else 0
+        edges = np.append(begin, index) + 0.5
     spans = itertools.pairwise([0, *np.flatnonzero(np.diff(task)) + 1, len(task)])
     return [(f"T{task[a]}", edges[a].item(), edges[b].item()) for a, b in spans]
 

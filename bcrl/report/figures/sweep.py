@@ -37,7 +37,7 @@ def _mark_decades(axis: Axis, values: Sequence[Any]) -> None:
     """Plain numbers on a logarithmic axis: `1 2 5 10`, or `1 10` if these are many."""
     few = max(values) < _MANY * min(values)
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
-    axis.set_major_formatter(lambda x, _: text_of(x))
+    axis.set_major_formatter(lambda x, _: f"{x:.12g}")
     axis.set_minor_formatter(NullFormatter())
 
 
@@ -89,7 +89,8 @@ def figure_final(
         ends = [variant.final(metric) for variant in sweep.variants.values()]
         mean = np.array([each.mean() for each in ends])
         low, high = np.transpose([bootstrap(each) for each in ends])
-        error = np.nan_to_num(np.stack([mean - low, high - mean]))
+        # Equal values: rounding can put the mean just outside its interval.
+        error = np.maximum(0, np.nan_to_num(np.stack([mean - low, high - mean])))
         axes.errorbar(x, mean, error, capsize=2.0, elinewidth=0.8, **lines[sweep.label])
     if numeric and _by_decades(values):
         axes.set_xscale("log")
@@ -119,7 +120,8 @@ def figure_map(runs: Runs, sweep: Sweep, metric: str, width: float) -> Figure:
     shown = {str(at): np.array([cells[at]]) for at in np.ndindex(cells.shape)}
     far = style.strays(metric, {n: v for n, v in shown.items() if np.isfinite(v).all()})
     within = np.concatenate([v for name, v in shown.items() if name not in far])
-    limits = {"vmin": np.nanmin(within), "vmax": np.nanmax(within)}
+    within = within[np.isfinite(within)]
+    limits = {"vmin": within.min(), "vmax": within.max()} if len(within) else {}
     image = axes.imshow(cells, cmap=_COLOURS, origin="lower", aspect="auto", **limits)
     if len(columns) <= _WRITTEN:
         _write(axes, cells, image.norm)
@@ -127,8 +129,11 @@ def figure_map(runs: Runs, sweep: Sweep, metric: str, width: float) -> Figure:
     axes.set_yticks(range(len(rows)), map(text_of, rows))
     axes.set(xlabel=sweep.keys[0], ylabel=sweep.keys[1])
     family = next(iter(sweep.variants.values())).family
-    bar = style.colour_bar(axes, image, shrink=1.0, aspect=25)
-    bar.set_label(curves.label(family, metric))
+    label = curves.label(family, metric)
+    if limits:
+        style.colour_bar(axes, image, shrink=1.0, aspect=25).set_label(label)
+    else:
+        axes.set_title(f"{label}: no values")
     what = f"{sweep.label}, {_ENDS[family]}, mean over seeds"
     return layout.caption(figure, runs, sweep.methods, what)
 

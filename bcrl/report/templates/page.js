@@ -179,7 +179,7 @@
     /** Places of a series' points that are to be drawn. */
     places(series) {
       const all = series.x.map((_, i) => i);
-      return this.state.target ? all.filter((i) => series.task[i] === series.task.at(-1)) : all;
+      return this.state.target ? all.filter((i) => series.task[i] === series.target) : all;
     }
 
     get domain() {
@@ -339,7 +339,9 @@
         low = Math.min(low, optimum);
         high = Math.max(high, optimum);
       }
-      const room = (high - low) * 0.05 || Math.abs(low) * 0.05 || 0.5;
+      // What differs in its last digits only is drawn as if it were equal.
+      const differs = high - low > Math.abs(low) * 1e-6;
+      const room = (differs ? high - low : Math.abs(low)) * 0.05 || 0.5;
       return [low - room, high + room];
     }
 
@@ -410,6 +412,8 @@
 
     zoom(ends) {
       if (!this.state.zoom) this.full = this.domain[1] - this.domain[0];
+      // Closer than one count there is nothing, and numbers are too coarse for ticks.
+      if (ends && ends[1] - ends[0] < Math.max(1, this.full * 1e-6)) return;
       this.state.zoom = ends;
       this.draw();
     }
