@@ -1,5 +1,6 @@
 """The API for notebooks: processes, saved frames, rows as they come, figures."""
 
+import importlib
 import inspect
 import re
 import subprocess
@@ -7,9 +8,11 @@ import sys
 import threading
 from dataclasses import dataclass, field, replace
 
+import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
+from gymnasium.envs.classic_control import CartPoleEnv
 from matplotlib.colors import to_hex
 from pandas.testing import assert_frame_equal
 
@@ -66,6 +69,20 @@ def test_processes_change_nothing_and_take_what_a_notebook_defines():
     for seed in (7, 0, 3):
         rows = pd.DataFrame([row for row in seen if row["seed"] == seed])
         assert same(rows, alone[alone.seed == seed].reset_index(drop=True))
+
+
+def test_other_processes_know_what_this_one_has_registered(tmp_path, monkeypatch):
+    (tmp_path / "my_poles.py").write_text("import tests.toys")
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.import_module("my_poles")
+    gymnasium.register("Mine-v0", entry_point=CartPoleEnv, max_episode_steps=20)
+    try:
+        for name in ("Mine-v0", "my_poles:Mine-v0"):
+            tasks = [api.Gymnasium(name, kwargs={"sutton_barto_reward": True})]
+            course = api.stages(tasks, replace(FAST, regressor=api.Forest(trees=2)))
+            assert same(trained(course, workers=2), trained(course))
+    finally:
+        del gymnasium.registry["Mine-v0"], sys.modules["my_poles"]
 
 
 @pytest.mark.slow

@@ -66,12 +66,15 @@ def module(key: str, name: str, where: str, known: Collection[str] = ()) -> Modu
     if not all(part.isidentifier() for part in where.split(".")):
         raise ConfigError(key, name, "isn't the name of a module")
     if where.partition(".")[0] not in known and not is_trusted(where):
-        why = "a config alone can't name code: type it, or pass its --config-dir"
+        why = "a config alone can't name code: type it, or pass its --config-dir; "
+        why += "in a script, import the module"
         raise ConfigError(key, name, why)
     try:
         return importlib.import_module(where)
     except Exception as error:  # whatever its code does
         why = f"can't be imported: {type(error).__name__}: {error}"
+        if isinstance(error, ModuleNotFoundError) and error.name == where:
+            why += "; put the folder that holds it into PYTHONPATH"
         raise ConfigError(key, name, why) from error
 
 

@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import sys
 import warnings
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -81,7 +82,8 @@ class Recipe:
 def spec_of(name: str) -> EnvSpec:
     """The environment `name`; `module:Name-v0` imports first; ConfigError if none."""
     module, _, plain = name.rpartition(":")
-    if module and (module not in PACKAGES or find_spec(module)):
+    there = module in sys.modules  # what it registers is known, too
+    if module and not there and (module not in PACKAGES or find_spec(module)):
         plugins.module("env.id", name, module, PACKAGES)
     if plain in gymnasium.registry:
         return gymnasium.registry[plain]

@@ -42,9 +42,9 @@ def _plan(folder: Path, document: dict[str, Any], trust: Iterable[str]) -> Plan:
         return recorded(config, document["env"], document["tag"])
     except ConfigError as error:
         what = unusable_config(error)
-        named = dict(plugins.named_code(config))
-        if error.key in named and not plugins.is_trusted(named[error.key]):
-            package = re.split("[.:]", named[error.key])[0]
-            what = f"its config names code, {error.key}={named[error.key]}; "
+        named = dict(plugins.named_code(config)).get(error.key, "")
+        package = re.split("[.:]", named)[0]
+        if named and not plugins.is_trusted(package):
+            what = f"its config names code, {error.key}={named}; "
             what += f"trust={package!r} lets it be imported"
-        raise BcrlError(f"{folder}: {what}") from error
+        raise BcrlError(f"{folder}: {what}") from None

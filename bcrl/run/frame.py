@@ -1,6 +1,8 @@
 """Training without files: rows as they are measured, in one process or in several."""
 
+import importlib
 import pickle
+import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
@@ -10,6 +12,7 @@ from numbers import Number
 from typing import Any
 
 import cloudpickle
+import gymnasium
 import numpy as np
 
 from bcrl.common.signals import Stop
@@ -67,7 +70,8 @@ def train_groups(groups: Sequence[SeedGroup], report: Report) -> None:
         _train(groups[0], partial(report, 0), Stop())
         return
     try:
-        jobs = [cloudpickle.dumps(group) for group in groups]
+        known = _registered(groups[0].stages)
+        jobs = [cloudpickle.dumps((*known, group)) for group in groups]
     except Exception as error:  # whatever a user's object raises
         why = f"can't send the stages to other processes ({error}); workers=1 can"
         raise ConfigError("workers", len(groups), why) from error
@@ -82,12 +86,24 @@ def train_groups(groups: Sequence[SeedGroup], report: Report) -> None:
 def _serve(job: bytes, report: Callable, stop: Any) -> tuple[str, ...]:
     """`_train` in another process; why it failed, if it did."""
     try:
-        _train(pickle.loads(job), report, stop)
+        modules, specs, group = pickle.loads(job)
+        for module in modules:
+            importlib.import_module(module)
+        gymnasium.registry.update(specs)
+        _train(group, report, stop)
     except BcrlError as error:
         return (str(error),)
     except Exception:  # unforeseen: show where
         return (traceback.format_exc(),)
     return ()
+
+
+def _registered(stages: Sequence[Stage]) -> tuple[set[str], dict[str, Any]]:
+    """What this process knows of the tasks' ids: modules imported, registry entries."""
+    ids = [str(getattr(stage.env, "id", "")).rpartition(":") for stage in stages]
+    names = {name for *_, name in ids} & {*gymnasium.registry}
+    modules = {module for module, *_ in ids} & {*sys.modules}
+    return modules, {name: gymnasium.registry[name] for name in names}
 
 
 def _train(group: SeedGroup, report: Callable, stop: Any) -> None:
