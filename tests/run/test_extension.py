@@ -84,7 +84,8 @@ def test_only_the_last_stage_may_be_longer(tmp_path):
     ):
         place = getattr(folder, "directory", folder)
         with pytest.raises(ConfigError, match=why):
-            run(tmp_path / why[:3], *words, *MORE, *more, f"extend={place}")
+            run(tmp_path / "none", *words, *MORE, *more, f"extend={place}")
+        assert not (tmp_path / "none").exists()
 
 
 SHORT, LONG = (
