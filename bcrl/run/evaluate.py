@@ -1,6 +1,7 @@
 """`bcrl-eval`: episodes of the agents that a run has left, in its tasks or others."""
 
 import argparse
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -18,7 +19,7 @@ from bcrl.common.seeding import stream
 from bcrl.common.terminal import ready, say, show
 from bcrl.common.text import estimate
 from bcrl.envs import Env, tasks_of
-from bcrl.errors import BcrlError
+from bcrl.errors import BcrlError, did_you_mean
 from bcrl.learning.agent import Agent
 from bcrl.learning.logged_files import check_target
 from bcrl.learning.rollout import CHOICES, Episodes, play, starts_and_draws, success_of
@@ -27,7 +28,8 @@ from bcrl.results.layout import AGENT, recorded_seeds
 from bcrl.run.agents import load
 
 _ABOUT = """Play greedy episodes with the agents of a run, write one row per episode to
-a CSV and print the returns. Words such as env.mass=1.4 change the task."""
+a CSV and print the returns. Words such as env.mass=1.4 change the task; those of a
+Gymnasium environment are env.kwargs.gravity=5 or env.attributes.gravity=5."""
 _RETURNS = ["return", "discounted_return"]
 
 
@@ -41,13 +43,14 @@ def episodes(agent: Agent, env: Env, n: int) -> Episodes:
     return played
 
 
-def table(agent: Agent, env: Env, played: Episodes) -> pd.DataFrame:
-    """A row per episode: seed, episode, its returns, whether it solved, its steps."""
+def table(agent: Agent, env: Env, played: Episodes, task: str) -> pd.DataFrame:
+    """A row per episode: seed, episode, returns, whether it solved, steps, `task`."""
     columns = {
         "return": played.reward[0].sum(-1),
         "discounted_return": played.discounted_return(env.gamma)[0],
         "solved": played.solved(success_of(env))[0].astype(int),
         "steps": played.length[0],
+        "task": task,
     }
     frame = pd.DataFrame(columns)
     frame.insert(0, "episode", np.arange(len(frame)))
@@ -85,6 +88,11 @@ def changed(task: Env, words: Sequence[str]) -> Env:
         if section != "env" or not name or not equals:
             raise BcrlError(f"{word}: unknown; env.KEY=VALUE changes the task")
         *above, last = name.split(".")
+        if (first := name.partition(".")[0]) not in values:
+            why = f"{word}: unknown; {did_you_mean(first, values)}"
+            if "kwargs" in values:
+                why += "; env.kwargs.NAME=VALUE is an argument of the environment"
+            raise BcrlError(why)
         place = values
         for part in above:
             if not isinstance(below := place.get(part) or {}, Mapping):
@@ -111,13 +119,22 @@ def _task(agent: Agent, number: int | None, words: Sequence[str]) -> Env:
     return env
 
 
+def described(config: Mapping[str, Any], env: Env, words: Sequence[str]) -> str:
+    """The constants in which the tasks of a run differ, and those of the words."""
+    names = [name for name, own in config["env"]["tasks"].items() if own is not None]
+    names += [word.partition("=")[0].split(".")[1] for word in words]
+    known = (f"{name}={getattr(env, name)}" for name in dict.fromkeys(names))
+    return ", ".join(known) or "target"
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Console entry point; 2 for bad input."""
     ready()
     try:
         _evaluate(_parser().parse_intermixed_args(arguments))
     except BcrlError as error:
-        say(f"bcrl-eval: {error}")
+        why = re.sub(r"\btrust='(\S+)'", r"--trust \1", str(error))  # it was Python
+        say(f"bcrl-eval: {why}")
         return 2
     return 0
 
@@ -135,7 +152,8 @@ def _evaluate(asked: argparse.Namespace) -> None:
         agent = load(asked.run, seed, trust=asked.trust)
         env = _task(agent, asked.task, asked.overrides)
         played = episodes(agent, env, asked.episodes)
-        found.append(table(agent, env, played))
+        task = described(agent.config, env, asked.overrides)
+        found.append(table(agent, env, played, task))
         logged += [played] if asked.record else []
     whole = pd.concat(found, ignore_index=True)
     path = asked.out or asked.run / "evaluation.csv"
@@ -143,7 +161,7 @@ def _evaluate(asked: argparse.Namespace) -> None:
     each = whole.groupby("seed")[[*_RETURNS, "solved"]].mean()
     show(each.round(4).to_string())
     show(means(whole))
-    show(f"{len(whole)} episodes in {path}")
+    show(f"{len(whole)} episodes of the task {task} in {path}")
     if asked.record:
         data = transitions(logged)
         show(f"{len(data.reward)} transitions in {data.save(asked.record)}")

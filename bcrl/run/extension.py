@@ -57,9 +57,9 @@ def adopt(longer: Plan) -> None:
     folder = Path(named).absolute()
     shorter = _plan(folder, longer)
     _check(longer, shorter, named)
-    records.make_run_directory(longer)
     found = checkpoints.stored(folder, STATE)
     about = checkpoints.about_of(replace(shorter, device=longer.device))
+    usable = dict[tuple[int, ...], Path]()
     groups = list[tuple[int, ...]]()  # of pending seeds that this run can't continue
     for path, own in found.items():
         seeds = tuple(own.pop("seeds", ()))
@@ -68,15 +68,18 @@ def adopt(longer: Plan) -> None:
         if not set(longer.asked).issuperset(seeds):
             groups.append(seeds)
         else:
-            label = checkpoints.about_of(longer) | {"seeds": list(seeds)}
-            data = serialization.relabelled(path, label)
-            write_bytes(checkpoints.checkpoint_path(longer, seeds), data)
+            usable[seeds] = path
             pending -= set(seeds)
     if pending:
         for own in found.values():
             if "error" in own:
                 raise own["error"]
         _refuse(folder, sorted(pending), groups, bool(found))
+    for seeds, path in usable.items():
+        label = checkpoints.about_of(longer) | {"seeds": list(seeds)}
+        data = serialization.relabelled(path, label)
+        records.make_run_directory(longer)
+        write_bytes(checkpoints.checkpoint_path(longer, seeds), data)
 
 
 def _plan(folder: Path, longer: Plan) -> Plan:
@@ -127,7 +130,7 @@ def _refuse(
     folder: Path, seeds: Sequence[int], groups: Sequence[Sequence[int]], found: bool
 ) -> None:
     """Raise ConfigError: no state of these seeds, or of `groups` that have others, too;
-    what they cost if they start anew."""
+    what to do, and what it costs."""
     spent = [
         records.read_facts(folder, seed).get("cpu_seconds", 0.0)
         for seed in recorded_seeds(folder, "json")
@@ -136,10 +139,10 @@ def _refuse(
     if groups:
         why += f"alone: seeds {', and '.join(map(spelled, groups))} were trained "
         why += "together; name all of a group (seeds=)"
-    elif found:
-        why += "(of this version and device)"
     else:
-        why += "(its run had no keep=state)"
+        why += "of this version and device" if found else "(its run had no keep=state)"
+        why += "; train them there again with keep=state: choose another tag, or "
+        why += "remove their files first"
     cost = max(spent, default=0.0) / 60
-    why += f"; without extend= they start anew, for more than {cost:.1f} core-minutes "
-    raise ConfigError("extend", str(folder), f"{why}each")
+    why += f" (that run took {cost:.1f} core-minutes per seed); without extend= "
+    raise ConfigError("extend", str(folder), f"{why}this run trains from the start")

@@ -7,7 +7,7 @@ from dataclasses import replace
 from bcrl.common import compiling
 from bcrl.common.signals import Interrupted, Stop
 from bcrl.common.terminal import say
-from bcrl.config.plan import Plan
+from bcrl.config.plan import KEEP, Plan
 from bcrl.errors import BcrlError
 from bcrl.evaluation import oracle
 from bcrl.evaluation.metrics import needs_reference
@@ -86,9 +86,25 @@ def _prepare(plan: Plan, quiet: bool) -> None:
     states = {seed: records.state(plan.directory, seed) for seed in plan.seeds}
     for line in records.problems(f"bcrl: {name}", states):
         say(f"{line}; it is computed again")
-    done = sum(state == COMPLETE for state, _ in states.values())
+    done = [seed for seed, (state, _) in states.items() if state == COMPLETE]
     if done and not quiet:
-        say(f"{name}: {done} of {len(plan.seeds)} seeds complete")
+        say(f"{name}: {len(done)} of {len(plan.seeds)} seeds complete")
+    _say_kept(plan, done)
+
+
+def _say_kept(plan: Plan, done: Sequence[int]) -> None:
+    """Name the complete seeds that keep less than the plan's `keep` asks for."""
+    reasons, asked = dict[int, str](), plan.config["keep"]
+    if asked == "stages" and plan.config["boosting"]["name"] != "off":
+        asked = "final"  # which then holds all stages
+    for seed in done:
+        kept = records.read_facts(plan.directory, seed)["config"].get("keep", "final")
+        if KEEP.index(kept) < KEEP.index(asked):
+            why = f"complete with keep={kept}, so keep={asked} has no effect on them; "
+            why += f"remove their files in {plan.directory}, or choose another tag"
+            reasons[seed] = why
+    for line in records.by_reason(f"{plan.env} {plan.name}", reasons):
+        say(line)
 
 
 def _train(jobs: Sequence[Job], failed: Failures, stop: Stop) -> None:

@@ -19,7 +19,7 @@ from bcrl.learning.transfer import StageResult
 from bcrl.q.functions import Sum
 from bcrl.q.regressors.base import Fitted
 from bcrl.results.layout import seed_path
-from bcrl.run import agent_files, job
+from bcrl.run import agent_files, evaluate, job
 from tests.run.runs import KINDS, MAZE, SMALL, TABULAR, about, resealed, rows, run
 
 FAST = ("maze BC", "maze C", "car_on_hill BC", "dqn SBC_released", "dqn RPL")
@@ -234,7 +234,7 @@ def test_an_agent_of_another_seed_is_not_taken_for_this_one(tmp_path):
         bcrl.load(made.directory)
 
 
-def test_a_config_that_names_code_needs_trust(tmp_path):
+def test_a_config_that_names_code_needs_trust(tmp_path, capsys):
     made = run(tmp_path, *MAZE)
     document = about(made, 0)
     env = document["config"]["env"] | {"name": "a_strangers.module"}
@@ -242,6 +242,8 @@ def test_a_config_that_names_code_needs_trust(tmp_path):
     resealed(path, config=document["config"] | {"env": env})
     with pytest.raises(BcrlError, match="trust='a_strangers'"):
         bcrl.load(made.directory)
+    assert evaluate.main([str(made.directory)]) == 2
+    assert "--trust a_strangers" in capsys.readouterr().err
 
 
 def test_what_plays_no_part_in_acting_does_not_prevent_loading(tmp_path):

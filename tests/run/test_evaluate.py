@@ -5,6 +5,8 @@ import pandas as pd
 import pytest
 
 import bcrl
+from bcrl.envs.gymnasium import Gymnasium
+from bcrl.errors import BcrlError
 from bcrl.learning.transitions import read_transitions
 from bcrl.run import evaluate
 from tests.run.runs import HILL, KINDS, rows, run
@@ -28,10 +30,27 @@ def test_episodes_are_evaluated_in_a_task_of_choice(made, tmp_path):
     assert evaluate.main([*words, "env.mass=0.8", *out]) == 0
     assert evaluate.main([*words, "--task", "1", "--out", str(path)]) == 0
     assert (tmp_path / "other.csv").read_text() == path.read_text() != first
+    assert (pd.read_csv(path)["task"] == "mass=0.8").all()
+    assert evaluate.main([*words, "env.horizon=50", "--task", "1"]) == 0
+    assert (pd.read_csv(path)["task"] == "mass=0.8, horizon=50").all()
     wrongs = ["env.mas=1"], ["mass=1"], ["--task", "4"], ["--episodes", "0"]
     for wrong in (*wrongs, ["env.mass=[1"], ["env.mass='1"], ["env.mass.x=1"]):
         assert evaluate.main([str(made.directory), *wrong]) == 2
     assert evaluate.main([str(tmp_path)]) == 2
+
+
+def test_arguments_of_a_gymnasium_environment_are_changed():
+    task = Gymnasium(id="CartPole-v1", horizon=5)
+    config = {"env": {"tasks": {"kwargs": None}}}
+    assert evaluate.described(config, task, []) == "target"
+    word = "env.kwargs.sutton_barto_reward=true"
+    other = evaluate.changed(task, [word])
+    assert other.kwargs == {"sutton_barto_reward": True}
+    said = evaluate.described(config, other, [word])
+    assert said == "kwargs={'sutton_barto_reward': True}"
+    for wrong in ("env.sutton_barto_reward=true", "env.tasks.kwargs=[{}]"):
+        with pytest.raises(BcrlError, match=r"env\.kwargs\.NAME"):
+            evaluate.changed(task, [wrong])
 
 
 def test_intervals_are_over_seeds_or_over_the_episodes_of_one():

@@ -84,7 +84,8 @@ def test_only_the_last_stage_may_be_longer(tmp_path):
     ):
         place = getattr(folder, "directory", folder)
         with pytest.raises(ConfigError, match=why):
-            run(tmp_path / why[:3], *words, *MORE, *more, f"extend={place}")
+            run(tmp_path / "none", *words, *MORE, *more, f"extend={place}")
+        assert not (tmp_path / "none").exists()
 
 
 SHORT, LONG = (
@@ -161,3 +162,16 @@ def test_residuals_that_an_interruption_lost_are_named(tmp_path, monkeypatch, ca
     made = run(tmp_path, *words, "keep=stages")
     n = 10 - len(bcrl.load(made.directory).residuals)
     assert n > 0 and f"residuals of {n} " in capsys.readouterr().err
+
+
+def test_complete_seeds_that_keep_less_than_asked_are_named(tmp_path, capsys):
+    def said(*words):
+        capsys.readouterr()
+        run(tmp_path, *TABULAR, *words)
+        return "no effect" in capsys.readouterr().err
+
+    assert not said("algorithm.iterations=1")
+    assert not said("algorithm.iterations=1", "keep=none")
+    assert said("algorithm.iterations=1", "keep=state")
+    assert not said("algorithm.iterations=1", "keep=state", "tag=y")
+    assert not said("algorithm.iterations=1", "keep=stages", "tag=y")
