@@ -56,7 +56,7 @@ def test_files_have_the_asked_size_in_print(written, tmp_path):
     for width, size in (("column", 3.25), ("5", 5.0)):
         out = tmp_path / width
         kinds = ["svg", "png", "pdf"][: 3 if width == "column" else 2]
-        words += ["--format", ",".join(kinds), "--width", width, "--out", str(out)]
+        words += ["--format", *kinds, "--width", width, "--out", str(out)]
         assert report(written, *words) == 0
         path = out / "compare_maze_smoke_solved.png"
         assert {p.suffix[1:] for p in out.iterdir()} == set(kinds)
