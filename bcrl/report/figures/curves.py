@@ -158,8 +158,7 @@ def draw_metrics(
 def _mark_changes(
     panels: Iterable[Axes], methods: Methods, lines: Mapping[str, style.Line] | None
 ) -> bool:
-    """Draw a dotted line of a curve's colour at each change of its task; whether there
-    are any."""
+    """Dotted lines of a curve's colour where its task changes; whether any does."""
     looks = lines or style.lines_of(methods)
     changes = {
         (start, looks[name]["color"])
