@@ -38,7 +38,9 @@ def draw_chosen(options: Namespace, out: Path, how: Print) -> list[Path]:
     metrics = _chosen_metrics(methods, options.metrics)
     envs = "+".join(dict.fromkeys(variant.env for variant in runs.variants))
     kind = "sweep" if options.sweep else "compare"
-    stem = options.name or f"{kind}_{envs}_{runs.scale.replace(' and ', '+')}"
+    tags = {variant.tag for variant in runs.variants}
+    tag = f"@{tags.pop()}" if len(tags) == 1 and None not in tags else ""
+    stem = options.name or f"{kind}_{envs}_{runs.scale.replace(' and ', '+')}{tag}"
     draw = _sweep_figures if options.sweep else _compared
     files, names = list[Path](), list[str]()
     for end, figure in draw(runs, methods, metrics, how.width, options):

@@ -58,8 +58,8 @@ def _parser() -> ResultsParser:
     add("--out", type=Path, help="default: figures in the runs' folder")
     text = "column (3.25 in), text (6.75 in) or inches; default: %(default)s"
     add("--width", default="text", help=text)
-    text = "kinds of the figures' files, of png, pdf, svg; default: %(default)s"
-    add("--format", default="png,pdf", metavar="LIST", help=text)
+    text = "kinds of the figures' files, of png, pdf, svg; default: png,pdf"
+    add("--format", nargs="+", default=["png,pdf"], metavar="KIND", help=text)
     text = "write the caption to a text file instead of below the figure"
     add("--caption-file", action="store_true", help=text)
     chosen = result.add_argument_group("instead of the report, one figure per metric")

@@ -24,7 +24,14 @@ COMPARED = {
     ("maze", "FQI"): METHODS,
     (LINEAR, "DQN"): ("DQN", "C-DQN", "BC-DQN", "SC-DQN", "SBC-DQN", "RPL", "PPR"),
 }
-_TITLES = {"car_on_hill": "Car on the hill"}
+_TITLES = {
+    "acrobot": "Acrobot",
+    "car_on_hill": "Car on the hill",
+    "cart_pole": "Cart pole",
+    "linear_system": "Linear system",
+    "maze": "Maze",
+    "mountain_car": "Mountain car",
+}
 
 Methods = Mapping[str, "Variant"]  # by the name of the method
 Pair = tuple[str, str]  # environment and family
@@ -164,8 +171,8 @@ class Runs:
 
 
 def env_title(env: str) -> str:
-    """An environment's name as a title, `Mountain car`."""
-    return _TITLES.get(env, env.replace("_", " ").capitalize())
+    """A shipped environment's name as a title, `Mountain car`; others as they are."""
+    return _TITLES.get(env, env)
 
 
 def listed(items: Iterable[object]) -> str:

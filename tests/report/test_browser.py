@@ -162,7 +162,7 @@ def test_the_page_is_drawn(page):
     assert page.texts("h1") == ["Boosted curriculum RL, scale smoke"]
     titles = page.texts("#runs-1 figcaption, #runs-2 figcaption, #runs-3 figcaption")
     assert any(title.startswith("error at the start, |Q − V*|") for title in titles)
-    assert "My <i>env, FQI" in page.texts("h2")  # names from files stay text
+    assert "my_<i>env, FQI" in page.texts("h2")  # names from files stay text
     assert page.all("h2 i, main script") == []
     for method in ("FQI", "C-FQI", "B-FQI", "BC-FQI"):
         assert page.inked("#runs-1 [data-metric=q_error]", method) > 100

@@ -21,13 +21,14 @@ from bcrl.report.figures.layout import TEXT, inches
 from bcrl.report.figures.sweep import figure_final, figure_map, figure_sweep
 from bcrl.report.load import load_chosen
 from bcrl.report.sweeps import Sweep, sweeps_of
-from bcrl.report.variants import Methods, Runs, tags_shown
+from bcrl.report.variants import _TITLES, Methods, Runs, env_title, tags_shown
 from bcrl.results.layout import seed_path
 from tests.report.runs import as_claimed, in_memory, report, write_dqn, write_fqi
 from tests.results.made_up import made_up_plan, reseal, write_seeds
 
 TAGGED = ("FQI", "BC-FQI", "BC-FQI@a", "BC-FQI@b")
 COLUMN = inches("column")
+ENVS = Path(__file__).parents[2] / "conf/env"
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,7 @@ def test_files_have_the_asked_size_in_print(written, tmp_path):
     for width, size in (("column", 3.25), ("5", 5.0)):
         out = tmp_path / width
         kinds = ["svg", "png", "pdf"][: 3 if width == "column" else 2]
-        words += ["--format", ",".join(kinds), "--width", width, "--out", str(out)]
+        words += ["--format", *kinds, "--width", width, "--out", str(out)]
         assert report(written, *words) == 0
         path = out / "compare_maze_smoke_solved.png"
         assert {p.suffix[1:] for p in out.iterdir()} == set(kinds)
@@ -68,6 +69,21 @@ def test_files_have_the_asked_size_in_print(written, tmp_path):
         assert float(svg[1]) == pytest.approx(72 * size)
     pdf = (tmp_path / "column/compare_maze_smoke_solved.pdf").read_bytes()
     assert float(re.search(rb"/MediaBox \[ *0 0 ([\d.]+)", pdf)[1]) == 234.0
+
+
+def test_a_common_tag_is_in_the_names_of_the_files(written, tmp_path):
+    for names in (["FQI", "BC-FQI"], ["FQI", "BC-FQI@a"], ["*@a"], ["*@b"]):
+        words = ["--compare", *names, "--env", "maze", "--metrics", "solved"]
+        out = ["--format", "svg", "--out", str(tmp_path)]
+        assert report(written, *words, *out) == 0
+    stems = {f"compare_maze_smoke{tag}_solved" for tag in ("", "@a", "@b")}
+    assert {path.stem for path in tmp_path.iterdir()} == stems
+
+
+def test_only_shipped_environments_have_titles():
+    ids = ["linear_system", "Nav2D-v0", "my_env"]
+    assert [*map(env_title, ids)] == ["Linear system", "Nav2D-v0", "my_env"]
+    assert {path.stem for path in ENVS.glob("*.yaml")} - {"gymnasium"} == {*_TITLES}
 
 
 def test_type_and_panels_keep_their_size_at_any_width(written):
@@ -127,9 +143,12 @@ def test_every_method_has_a_look_of_its_own_without_colours():
 def test_tasks_are_shaded_where_they_are_those_of_all_curves(written, names, shaded):
     runs, methods = chosen(written, *names)
     figure = figure_metrics(runs, methods, ["return"], TEXT)
-    names = [text for text in figure.axes[0].texts if text.get_text()[0] == "T"]
-    assert len(names) == shaded
+    named = [text for text in figure.axes[0].texts if text.get_text()[0] == "T"]
+    assert len(named) == shaded
     assert ("tasks" in figure.get_label()) == bool(shaded)
+    dotted = [line for line in figure.axes[0].lines if line.get_linestyle() == ":"]
+    assert len(dotted) == (0 if shaded else 9 * ("BC-FQI" in names))
+    assert ("dotted" in figure.get_label()) == bool(dotted)
     assert "bootstrap" in figure.get_label()
 
 
@@ -176,7 +195,8 @@ def test_steps_are_counted_for_dqn_and_a_target_can_be_drawn_alone(written):
     figure = figure_metrics(runs, methods, ["return"], COLUMN, target_only=True)
     assert figure.axes[0].get_xlabel() == "environment steps"
     starts = [line.get_xdata()[0] for line in figure.axes[0].lines]
-    assert starts == [500, 2000]
+    assert starts == [500, 2000] and figure.axes[0].get_xlim()[0] < 0
+    assert "exploring: with random actions" in figure.get_label()
 
 
 WRONG = [

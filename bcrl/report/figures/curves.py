@@ -1,5 +1,6 @@
 """Learning curves of any variants; Figures 1, 2 and 5 of the paper are such."""
 
+import itertools
 import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -122,6 +123,8 @@ def draw_panels(
             style.shade_tasks(axes, spans)
         draw_metric(axes, methods, metric, **how)
         axes.set(xlabel=COUNTED[family], ylabel=ylabel)
+        if family == "DQN" and not spans:  # the first value may come after many steps
+            axes.update_datalim([(0.0, 0.0)], updatey=False)
         axes.margins(x=0.0 if spans else 0.015)
         style.number_axis(axes)
     return figure, found
@@ -135,16 +138,36 @@ def draw_metrics(
     lines: Mapping[str, style.Line] | None = None,
 ) -> tuple[Figure, list[Axes], str]:
     """Panels of any variants of one family, tasks shaded where all variants have them
-    at the same time, and what a caption says of the tasks."""
+    at the same time, else with a dotted line at each change of a variant's task, and
+    what a caption says of the tasks and of the metrics."""
     family = next(variant.family for variant in methods.values())
     labels = {m: _wrapped(label(family, m)) for m in metrics}
     spans = [] if target_only else common_spans(methods)
     rows = target_rows if target_only else spread_rows
-    drawn = draw_panels(methods, labels, width, spans, rows=rows, lines=lines)
-    shaded = (
-        ", grey bands: tasks" if spans else ", target task only" if target_only else ""
-    )
-    return *drawn, shaded
+    figure, found = draw_panels(methods, labels, width, spans, rows=rows, lines=lines)
+    if target_only:
+        told = ", target task only"
+    elif spans:
+        told = ", grey bands: tasks"
+    else:
+        told = ", dotted: new task" * _mark_changes(found, methods, lines)
+    explored = any("exploring" in text for text in labels.values())
+    return figure, found, told + ", exploring: with random actions" * explored
+
+
+def _mark_changes(
+    panels: Iterable[Axes], methods: Methods, lines: Mapping[str, style.Line] | None
+) -> bool:
+    """Dotted lines of a curve's colour where its task changes; whether any does."""
+    looks = lines or style.lines_of(methods)
+    changes = {
+        (start, looks[name]["color"])
+        for name, variant in methods.items()
+        for _, start, _ in style.task_spans(variant)[1:]
+    }
+    for axes, (at, colour) in itertools.product(panels, sorted(changes)):
+        axes.axvline(at, color=colour, linestyle=":", linewidth=0.8, zorder=1.5)
+    return bool(changes)
 
 
 def figure_metrics(
@@ -157,13 +180,13 @@ def figure_metrics(
 ) -> Figure:
     """One panel per metric, with a curve and its interval for each of any variants.
     `lines`: other looks."""
-    figure, found, shaded = draw_metrics(methods, metrics, width, target_only, lines)
+    figure, found, told = draw_metrics(methods, metrics, width, target_only, lines)
     fqi = all(variant.family == "FQI" for variant in methods.values())
     optimum = optimum_of(methods) if fqi and "return" in metrics else None
     if optimum is not None:
         found[metrics.index("return")].axhline(optimum, **style.OPTIMUM)
     known = optimum is not None
-    what = BAND + shaded
+    what = BAND + told
     return layout.finish(figure, runs, methods, what, optimum=known, lines=lines)
 
 

@@ -57,13 +57,13 @@ def inches(width: str) -> float:
     return value
 
 
-def formats(names: str) -> list[str]:
-    """The kinds of files in `pdf,svg`; BcrlError for an unknown one."""
-    found = list(dict.fromkeys(names.lower().replace(" ", "").split(",")))
-    for name in found:
-        if name not in FORMATS:
-            allowed = ", ".join(FORMATS)
-            raise BcrlError(f"--format {names}: must be one or several of {allowed}")
+def formats(words: Sequence[str]) -> list[str]:
+    """The kinds of files in `png`, `pdf,svg`; BcrlError for none or an unknown one."""
+    given = " ".join(words)
+    found = list(dict.fromkeys(given.lower().replace(",", " ").split()))
+    if not found or not set(found) <= set(FORMATS):
+        allowed = ", ".join(FORMATS)
+        raise BcrlError(f"--format {given}: must be one or several of {allowed}")
     return found
 
 

@@ -59,7 +59,7 @@ def figure_sweep(
     for line, value in zip(lines.values(), at, strict=True):
         line |= {"color": _COLOURS(_LIGHTEST * float(norm(value))), "linestyle": "-"}
         line |= {"marker": "", "linewidth": 1.1} if barred else {}
-    figure, (axes,), shaded = curves.draw_metrics(
+    figure, (axes,), told = curves.draw_metrics(
         methods, [metric], width, target_only, lines
     )
     if barred:
@@ -71,7 +71,7 @@ def figure_sweep(
             _mark_decades(bar.ax.yaxis, values)
     else:
         layout.legend(figure, lines.items(), key)
-    what = f"{sweep.label}, colour: {key}, {curves.BAND}{shaded}"
+    what = f"{sweep.label}, colour: {key}, {curves.BAND}{told}"
     return layout.caption(figure, runs, methods, what)
 
 
