@@ -119,7 +119,7 @@ def _task(agent: Agent, number: int | None, words: Sequence[str]) -> Env:
     return env
 
 
-def described(config: Mapping[str, Any], env: Env, words: Sequence[str]) -> str:
+def task_text(config: Mapping[str, Any], env: Env, words: Sequence[str]) -> str:
     """The constants in which the tasks of a run differ, and those of the words."""
     names = [name for name, own in config["env"]["tasks"].items() if own is not None]
     names += [word.partition("=")[0].split(".")[1] for word in words]
@@ -152,7 +152,7 @@ def _evaluate(asked: argparse.Namespace) -> None:
         agent = load(asked.run, seed, trust=asked.trust)
         env = _task(agent, asked.task, asked.overrides)
         played = episodes(agent, env, asked.episodes)
-        task = described(agent.config, env, asked.overrides)
+        task = task_text(agent.config, env, asked.overrides)
         found.append(table(agent, env, played, task))
         logged += [played] if asked.record else []
     whole = pd.concat(found, ignore_index=True)

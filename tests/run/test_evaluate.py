@@ -42,11 +42,11 @@ def test_episodes_are_evaluated_in_a_task_of_choice(made, tmp_path):
 def test_arguments_of_a_gymnasium_environment_are_changed():
     task = Gymnasium(id="CartPole-v1", horizon=5)
     config = {"env": {"tasks": {"kwargs": None}}}
-    assert evaluate.described(config, task, []) == "target"
+    assert evaluate.task_text(config, task, []) == "target"
     word = "env.kwargs.sutton_barto_reward=true"
     other = evaluate.changed(task, [word])
     assert other.kwargs == {"sutton_barto_reward": True}
-    said = evaluate.described(config, other, [word])
+    said = evaluate.task_text(config, other, [word])
     assert said == "kwargs={'sutton_barto_reward': True}"
     for wrong in ("env.sutton_barto_reward=true", "env.tasks.kwargs=[{}]"):
         with pytest.raises(BcrlError, match=r"env\.kwargs\.NAME"):
