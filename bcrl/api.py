@@ -132,7 +132,7 @@ def run(
     Args:
         stages: What `stages` returns; its learners say how often to evaluate.
         seeds: Different whole numbers from 0 on, such as range(5) or [3, 7].
-        metrics: Names of FQI's metrics; DQN records all of its own.
+        metrics: Names of FQI's metrics; DQN always records all its metrics.
         threads: Threads per process that grow forests; None divides the cores among the
             workers. They change no result.
         progress: Whether a bar shows the iterations or steps done.

@@ -61,7 +61,7 @@ class SeedGroup:
 
 
 def train_groups(groups: Sequence[SeedGroup], report: Report) -> None:
-    """Train each group in a process of its own, a single one in this process.
+    """Train each group in a separate process, a single one in this process.
 
     Raises BcrlError if a seed diverges or a process fails, ConfigError for stages that
     can't be sent to a process.

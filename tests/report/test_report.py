@@ -99,7 +99,7 @@ def test_everything_is_written_listed_and_byte_identical(runs_dir, tmp_path, cap
     for out in (tmp_path / "a", tmp_path / "b"):
         assert report(runs_dir, "--out", str(out)) == 0
         captured = capsys.readouterr()
-        assert captured.err == ""  # nobody asked for the linear system's figures
+        assert captured.err == ""  # not about figures that were not requested
         assert set(captured.out.split()) == {str(out / name) for name in names}
         assert {path.name for path in out.iterdir()} == names
     for name in names:
