@@ -18,6 +18,10 @@ def identity(config: Plain) -> Plain:
     algorithm = kept.get("algorithm", {})
     if "dataset_sha256" in algorithm:  # logged data: where they lie changes nothing
         kept["algorithm"] = {k: v for k, v in algorithm.items() if k != "dataset"}
+    # A factor of 1 is none, and older runs don't name it.
+    boosting = kept.get("boosting")
+    if isinstance(boosting, dict) and boosting.get("alpha") == 1.0:
+        kept["boosting"] = {k: v for k, v in boosting.items() if k != "alpha"}
     # A run decides what starts from it by its config, wherever its folder is.
     start = {k: v for k, v in kept.pop("start", {}).items() if v and k != "from"}
     return kept | ({"start": start} if start else {})

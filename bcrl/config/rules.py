@@ -116,6 +116,7 @@ def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
 def _check_fqi(chosen: Composition, learner: FQI, env: Env, start: StageInit) -> None:
     check_numbers("algorithm", vars(learner))
     regressor, why = learner.regressor, ""
+    boost = replace(start.boost, alpha=1.0)
     key, value = "algorithm.regressor", cast(Any, regressor)
     if isinstance(regressor, type) or not hasattr(regressor, "finite_only"):
         why = "is no regressor of ours; Sklearn(estimator) makes one of scikit-learn's"
@@ -124,10 +125,10 @@ def _check_fqi(chosen: Composition, learner: FQI, env: Env, start: StageInit) ->
     elif learner.shared_data and learner.epsilon < 1:
         key, value = "algorithm.dataset", "shared"
         why = "seeds can share data only if all are random: algorithm.epsilon must be 1"
-    elif chosen.boost and start.boost != Boost():
+    elif chosen.boost and boost != Boost():
         key, value = "boosting", chosen.boost
         why = "is the released DQN's; FQI learns with the paper's, boosting=on"
-    elif start.behavior or (start.boost, start.shape or Shape()) != (Boost(), Shape()):
+    elif start.behavior or (boost, start.shape or Shape()) != (Boost(), Shape()):
         key, value = "transfer", chosen.transfer
         why = "is for algorithm=dqn; FQI learns with transfer=shaping, or without one"
     if why:

@@ -27,8 +27,12 @@ from bcrl.errors import BcrlError, ConfigError
 from bcrl.results.layout import CONFIG, recorded_seeds
 from bcrl.results.read import read_document
 
-#: The options that follow the authors' code, all of them with the tag `released`.
-RELEASED = {"boosting=on": "released", "transfer=shaping": "shaping_released"}
+#: Tag → the options that it stands for, in place of the paper's.
+NAMED = {
+    None: {},
+    "released": {"boosting=on": "released", "transfer=shaping": "shaping_released"},
+    "line_search": {"boosting=on": "line_search"},
+}
 #: The env that a command completes by an id, after which its results are named.
 OPEN = "gymnasium"
 
@@ -40,16 +44,16 @@ def tag_of(
 ) -> tuple[str | None, Plain]:
     """A job's tag and the settings that it stands for.
 
-    The tag is the given one, none for the paper's options, `released`, or a digest of
+    The tag is the given one, none for the paper's options, one of NAMED, or a digest of
     the settings that differ from the method's defaults.
     """
     given, choices = config["tag"], hydra.runtime.choices
     usual: dict[str | None, Options] = {
-        tag: _options(config, choices, tag is not None) for tag in (None, "released")
+        tag: _options(config, choices, named) for tag, named in NAMED.items()
     }
     if not folders and _only_chooses(hydra):
         for tag, named in usual.items():
-            known = tag is None or given is None  # `released` says what it stands for
+            known = tag is None or given is None  # one of NAMED says what it means
             if known and named.items() <= dict(choices).items():
                 return given or tag, {}
     changes = []
@@ -74,7 +78,7 @@ def settings_of(folder: Path, folders: Paths) -> Plain:
     env, groups = folder.parent.name, catalog(folders)
     try:
         config = yaml.safe_load((folder / CONFIG).read_bytes())
-        options = _options(config, {}, False)
+        options = _options(config, {}, NAMED[None])
         if env not in groups["env"] and re.fullmatch(r"[\w./:-]+", config["env"]["id"]):
             env = OPEN
         known = all(option in groups[group] for group, option in options.items())
@@ -140,15 +144,14 @@ def _recorded(folder: object) -> Plain:
         raise ConfigError("start.from", folder, f"its config lacks {error}") from error
 
 
-def _options(config: Plain, choices: Options, released: bool) -> Options:
+def _options(config: Plain, choices: Options, named: Options) -> Options:
     """The options of a config's method: ours by their names, others as chosen."""
     found = {}
     for group in VARIANT_GROUPS[1:]:
         option = config[group].get("name")
         if group in ("curriculum", "boosting"):
             option = "off" if option == "off" else "on"
-        if released:
-            option = RELEASED.get(f"{group}={option}", option)
+        option = named.get(f"{group}={option}", option)
         shipped = (CONF / group / f"{option}.yaml").exists()
         found[group] = option if shipped else choices.get(group, option)
     return found

@@ -14,6 +14,7 @@ from bcrl.errors import BcrlError, ConfigError
 from bcrl.evaluation import oracle
 from bcrl.learning import Booleans, Floats, Integers, rollout
 from bcrl.learning.fqi import Iteration
+from bcrl.learning.line_search import Searched
 from bcrl.learning.stage import Snapshot
 
 
@@ -67,10 +68,23 @@ class SeedProbe:
         #: Seeds, by index, that can't continue after the latest measurement, and why.
         self.failed: dict[int, str] = {}
 
-    def place(self, snapshot: Snapshot) -> dict[str, int]:
-        """The first columns of a snapshot's rows: stage, task and count."""
-        stage = snapshot.stage
-        return {"stage": stage.number, "task": stage.task, self.index: snapshot.count}
+    def measure(self, snapshot: Any) -> list[dict[str, float]]:
+        """Each seed's metrics."""
+        raise NotImplementedError
+
+    def rows(self, snapshot: Snapshot) -> list[dict[str, float]]:
+        """Each seed's row: stage, task and count, metrics, and the scale of its base.
+
+        The scale has columns only in runs that change it.
+        """
+        stage, found = snapshot.stage, snapshot.searched
+        place = {"stage": stage.number, "task": stage.task, self.index: snapshot.count}
+        rows: list[dict[str, float]] = [place | own for own in self.measure(snapshot)]
+        if stage.rescales:
+            found = found or Searched.fixed(np.nan, len(rows))
+            pairs = zip(rows, found.alpha.tolist(), found.base_fit.tolist(), strict=True)
+            rows = [row | {"alpha": a, "base_fit": fit} for row, a, fit in pairs]
+        return rows
 
     def shown(self, episodes: rollout.Episodes, s: int, e: int) -> dict[str, NDArray]:
         """Episode e of the seed with index s, and the scene, as the NPZ stores them."""

@@ -13,18 +13,20 @@ from bcrl.envs import lanes_of
 from bcrl.envs.base import Lanes
 from bcrl.learning import Floats, Integers
 from bcrl.learning.bellman import precompute_target, shaping
+from bcrl.learning.line_search import Searched, search
 from bcrl.learning.policies import combined_actions, epsilon_greedy, greedy
 from bcrl.learning.replay import Replay, batched, one_by_one
 from bcrl.learning.rollout import CHOICES
 from bcrl.learning.stage import Pause, SeedBatch, Stage, StepSnapshot
 from bcrl.learning.transfer import (
+    SEARCH,
     Acting,
     PolicyReuse,
     ResidualPolicy,
     StageInit,
     StageResult,
 )
-from bcrl.q.functions import Q, add
+from bcrl.q.functions import ZERO, Q, add
 from bcrl.q.networks.mlp import Adam, DeepQ, Networks, xavier
 
 DRAW_BLOCK = 500  # steps per block; each block has its own random stream
@@ -45,6 +47,9 @@ class DQNState:
     updates: int = 0  # since the last snapshot
     step: int = 0  # steps done in this stage
     residual: Any = None  # (S, A) ϱ at `env_state`, if computed
+    searched: Searched | None = None  # of the base; None: not yet, or α is 1
+    #: Reward, absorbing, next base and base of each step so far, until α is searched.
+    unscaled: list[tuple[Any, ...]] | None = None
 
 
 @dataclass(eq=False)
@@ -62,6 +67,8 @@ class DQNTrainer:
         self.state = now = self.state or self._initial_state()
         updater = one_by_one if now.replay.rows.is_cpu else batched
         self._gradient_step = updater(now.deep, now.replay)
+        if now.searched is not None:
+            self.start = self.start.rescaled(now.searched.alpha)
         self._frozen = self._frozen_at(now.env_state)  # before the present step
         if isinstance(self.start.behavior, ResidualPolicy):
             self._combined = combined_actions(self.env.actions)
@@ -86,7 +93,13 @@ class DQNTrainer:
             deep = DeepQ(online, target, adam)
         shape = (n, settings.replay_size, env.state_dim, env.n_actions)
         replay, (steps, decisions) = Replay.empty(*shape, device), np.zeros((2, n), int)
-        return DQNState(deep, replay, lanes, env_state, steps, decisions, np.zeros(n))
+        begun = (deep, replay, lanes, env_state, steps, decisions, np.zeros(n))
+        alpha = self.start.boost.alpha
+        if self.start.base is ZERO or alpha == 1.0:
+            return DQNState(*begun)
+        if alpha == SEARCH:
+            return DQNState(*begun, unscaled=[])
+        return DQNState(*begun, searched=Searched.fixed(alpha, n))
 
     def act(self) -> None:
         """Every seed makes one environment step and stores the transition."""
@@ -113,8 +126,11 @@ class DQNTrainer:
             zero = start.shape.zero_at_goal
             reward = reward + shaping(v, next_v, absorbing, env.gamma, zero)
         now_base = base[np.arange(len(own)), own]
-        known = (reward, absorbing, next_base, now_base, env.gamma, start.boost)
-        now.replay.add(now.env_state, next_state, *precompute_target(*known), own)
+        known = (reward, absorbing, next_base, now_base)
+        target = precompute_target(*known, env.gamma, start.boost)
+        now.replay.add(now.env_state, next_state, *target, own)
+        if now.unscaled is not None:
+            now.unscaled.append(known)
         now.steps_in_episode += 1
         over = absorbing | cut | (now.steps_in_episode == env.horizon)
         if over.any():
@@ -172,8 +188,25 @@ class DQNTrainer:
         own = np.where(few & (u[..., 0] >= epsilon), advised, own)
         return own, self._combined[advised, own]
 
+    def _search(self) -> None:
+        """Choose each seed's α by the transitions so far, and restate their targets."""
+        now, gamma = self.state, self.env.gamma
+        columns = zip(*now.unscaled, strict=True)
+        reward, absorbing, after, base = (np.stack(x, 1) for x in columns)  # (S, n, …)
+        each = zip(reward, base, after, absorbing, strict=True)
+        found = Searched.of([search(*own, gamma) for own in each])
+        alpha = found.alpha[:, None]
+        known = (reward, absorbing, alpha[..., None] * after, alpha * base)
+        target = precompute_target(*known, gamma, self.start.boost)
+        now.replay.restate(*target[:2])
+        now.searched, now.unscaled = found, None
+        self.start = self.start.rescaled(found.alpha)
+        self._frozen = self._frozen_at(now.env_state)
+
     def update(self) -> None:
         """One gradient step for each seed, each on its batch."""
+        if self.state.unscaled is not None:
+            self._search()
         now, target_update = self.state, self.settings.target_update
         at, since = now.step % DRAW_BLOCK, now.deep.steps % target_update
         # After a copy of the target (or a new block) the batches until the next one.
@@ -215,7 +248,8 @@ class DQNTrainer:
         result = StageResult(q, now.deep, acting=self._acting())
         measured = (self._evaluated_policy, self.settings.evaluation_episodes, loss)
         failed |= now.lanes.failures  # each seed has one lane
-        return StepSnapshot(self.stage, count, now, result, *measured, failed=failed)
+        more = {"searched": now.searched, "failed": failed}
+        return StepSnapshot(self.stage, count, now, result, *measured, **more)
 
     def _acting(self) -> Acting:
         """What the greedy policy reads at present."""

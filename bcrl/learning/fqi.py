@@ -1,6 +1,6 @@
 """Fitted Q-iteration, plain or boosted: every stage learns a residual on a base."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -12,8 +12,9 @@ from bcrl.envs import is_finite, is_simulated
 from bcrl.learning import Floats, dataset, rollout
 from bcrl.learning.bellman import residual_target, shaping
 from bcrl.learning.dataset import Dataset
+from bcrl.learning.line_search import Searched, search
 from bcrl.learning.stage import Pause, SeedBatch, Snapshot, Stage
-from bcrl.learning.transfer import StageInit, StageResult
+from bcrl.learning.transfer import SEARCH, StageInit, StageResult
 from bcrl.learning.transitions import Logged, transitions_of
 from bcrl.q.functions import NOT_FINITE, ZERO, Q, Table, Values, query
 from bcrl.q.regressors.base import Cell, Fitted, FittedQ, Problem, Regressor, fit_each
@@ -87,6 +88,10 @@ class FQI:
             d.reward + shaping(v[d.state], v[d.next_state], d.absorbing, env.gamma)
             for d, v in zip(data, potential, strict=True)
         ]
+        searched = self._scales(start, base, reward, data, env.gamma)
+        if searched is not None:
+            start = start.rescaled(searched.alpha)
+            base = [a * q for a, q in zip(searched.alpha, base, strict=True)]
         models: list[list[Fitted | None]] = [[None] * n_actions for _ in data]
         if isinstance(start.initial, FittedQ):
             models = [list(row) for row in start.initial.models]
@@ -137,7 +142,28 @@ class FQI:
                 [values[d.probe] for values, d in zip(each, data, strict=True)]
                 for each in (total, residual)
             )
-            yield Iteration(stage, count, after, result, *probed, failed=failed)
+            more = {"searched": searched, "failed": failed}
+            yield Iteration(stage, count, after, result, *probed, **more)
+
+    def _scales(
+        self,
+        start: StageInit,
+        base: Sequence[Floats],
+        reward: Sequence[Floats],
+        data: Sequence[Dataset],
+        gamma: float,
+    ) -> Searched | None:
+        """The scales of S bases, whose values at all points are S arrays (P, A)."""
+        alpha = start.boost.alpha
+        if start.base is ZERO or alpha == 1.0:
+            return None
+        if alpha != SEARCH:
+            return Searched.fixed(alpha, len(data))
+        each = zip(data, base, reward, strict=True)
+        return Searched.of([
+            search(r, q[d.state, d.action], q[d.next_state], d.absorbing, gamma, d.multiplicity)
+            for d, q, r in each
+        ])
 
     def _collect(self, stage: Stage, start: StageInit, batch: SeedBatch) -> FQIState:
         """The state before the first iteration, with a dataset for each seed."""

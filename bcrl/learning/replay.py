@@ -63,6 +63,12 @@ class Replay:
         self.valid[:, index] = False
         self.added += 1
 
+    def restate(self, next_base: Floats, fixed: Floats) -> None:
+        """Replace these of all n transitions of each seed: (S, n, A) and (S, n)."""
+        new = np.concatenate([next_base, fixed[..., None]], -1)
+        self.rows[:, : self.size, 2 * self.d : -2] = torch.from_numpy(new)
+        self.valid[:] = False
+
     def indices(self, u: Floats, past: int = 0) -> NDArray[np.int64]:
         """Rows (T, S, B) that uniforms u (T, S, B) draw in T steps, with replacement.
 

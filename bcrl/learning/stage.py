@@ -8,8 +8,9 @@ from bcrl.common.serialization import storable
 from bcrl.envs import Env
 from bcrl.errors import BcrlError
 from bcrl.learning import Floats
+from bcrl.learning.line_search import Searched
 from bcrl.learning.rollout import Policy
-from bcrl.learning.transfer import StageInit, StageResult, Transfer, begin
+from bcrl.learning.transfer import Boost, StageInit, StageResult, Transfer, begin
 from bcrl.q.functions import ZERO
 
 
@@ -50,6 +51,12 @@ class Stage:
     before: int  # iterations or environment steps of all previous stages
     own_task: int = 0  # its position without the tasks of a source; 0: it is `task`
 
+    @property
+    def rescales(self) -> bool:
+        """Whether the base has a factor other than 1."""
+        boosts = (t for t in self.transfers if isinstance(t, Boost))
+        return any(boost.alpha != 1.0 for boost in boosts)
+
 
 @dataclass(frozen=True)
 class Pause:
@@ -65,6 +72,7 @@ class Snapshot(Pause):
     """A pause at which the learned Q-functions can be evaluated."""
 
     result: StageResult
+    searched: Searched | None = field(default=None, kw_only=True)  # of the base
     #: Seeds that cannot continue, by index in the batch, and why.
     failed: dict[int, str] = field(default_factory=dict, kw_only=True)
 

@@ -4,8 +4,10 @@ A transfer edits the next stage's `StageInit`, which is all that learners read. 
 can be combined: `Boost` and `Shape` make SBC-DQN.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from typing import Any, Literal
 
 import numpy as np
@@ -14,7 +16,10 @@ from numpy.typing import NDArray
 from bcrl.common.seed_axis import seeds_on
 from bcrl.common.serialization import storable
 from bcrl.errors import ConfigError, at_least
-from bcrl.q.functions import ZERO, Q, Shaped, Sum, add, memoized
+from bcrl.learning import Floats
+from bcrl.q.functions import ZERO, Q, Scaled, Shaped, Sum, add, memoized
+
+SEARCH = "search"  # a value of `Boost.alpha`
 
 
 @storable
@@ -47,11 +52,20 @@ class Boost:
     `maxima`: the target bootstraps with `one` maximum, that of the sum, or with `two`,
     max ϱ + max base. `mask_at_goal`: the base does not count in absorbing next states.
     The defaults are the paper's; the released BC-DQN has residual, two and false.
+    `alpha`: a factor ≥ 0 of the base, or `search` for one that suits each seed's data
+    (`line_search`; not in the paper). Raises ConfigError for another.
     """
 
     greedy_on: Literal["sum", "residual"] = "sum"
     maxima: Literal["one", "two"] = "one"
     mask_at_goal: bool = True
+    alpha: float | Literal["search"] = 1.0
+
+    def __post_init__(self) -> None:
+        number = isinstance(self.alpha, Real) and not isinstance(self.alpha, bool)
+        if self.alpha != SEARCH and not (number and 0.0 <= self.alpha < math.inf):
+            why = "must be a number of at least 0, or search"
+            raise ConfigError("boosting.alpha", self.alpha, why)
 
     def __call__(self, start: "StageInit", previous: StageResult) -> "StageInit":
         return replace(start, base=previous.q, boost=self)
@@ -125,6 +139,10 @@ class StageInit:
         if self.shape is None:
             return add(self.base, residual)
         return Shaped(self.base, residual, self.potential)
+
+    def rescaled(self, alpha: Floats) -> "StageInit":
+        """The same with each seed's base times its entry of `alpha` (S,)."""
+        return replace(self, base=Scaled(self.base, alpha))
 
     def memoized(self) -> "StageInit":
         """The same with a base and a potential that cache their values."""

@@ -113,6 +113,19 @@ class Sum:
 
 @storable
 @dataclass(frozen=True)
+class Scaled:
+    """A Q-function times a factor of each seed."""
+
+    q: Q
+    factor: NDArray[np.float64] = field(metadata=seeds_on(0))  # (S,)
+
+    def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
+        values = self.q(states, n_actions)
+        return each(states, lambda s: self.factor[s] * values[s])
+
+
+@storable
+@dataclass(frozen=True)
 class Mapped:
     """A Q-function of other observations: q(observation(s)), state by state."""
 

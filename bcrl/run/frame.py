@@ -51,9 +51,8 @@ class SeedGroup:
             probe = Probe(self.seeds, tasks, self.metrics)
         batch = SeedBatch(self.seeds, probe.states, self.threads, self.device)
         for snapshot in learn(self.stages, batch):
-            place, found = probe.place(snapshot), probe.measure(snapshot)
-            pairs = zip(self.seeds, found, strict=True)
-            yield snapshot, [{"seed": seed} | place | row for seed, row in pairs]
+            pairs = zip(self.seeds, probe.rows(snapshot), strict=True)
+            yield snapshot, [{"seed": seed} | row for seed, row in pairs]
             reasons = [f"seed {self.seeds[s]}: {x}" for s, x in probe.failed.items()]
             if reasons:
                 where = f"at {probe.index} {snapshot.count}"

@@ -149,8 +149,7 @@ class _Training:
 
     def measure(self, snapshot: Snapshot) -> None:
         """Append a row per seed; a failed seed's last row shows the failure."""
-        index, where = self.probe.index, self.probe.place(snapshot)
-        new = [[where | metrics] for metrics in self.probe.measure(snapshot)]
+        index, new = self.probe.index, [[row] for row in self.probe.rows(snapshot)]
         for place in self.failed:
             new[place] = []
         self.log(new)
