@@ -14,9 +14,10 @@ from bcrl.envs import Env, is_finite
 from bcrl.errors import ConfigError
 from bcrl.learning.dqn import DQN
 from bcrl.learning.fqi import FQI
+from bcrl.learning.line_search import LEAST
 from bcrl.learning.lspi import LSPI
 from bcrl.learning.stage import Learner, Stage
-from bcrl.learning.transfer import Boost, Shape, StageInit, warm_start
+from bcrl.learning.transfer import SEARCH, Boost, Shape, StageInit, warm_start
 from bcrl.learning.transitions import LoggedFile, transitions_of
 from bcrl.q.functions import ZERO
 from bcrl.q.quadratic import FEATURES
@@ -156,6 +157,9 @@ def _check_dqn(chosen: Composition, learner: DQN, start: StageInit) -> None:
     elif not widths or not all(isinstance(w, Integral) and w >= 1 for w in widths):
         key, value = "algorithm.hidden", list(widths)
         why = "must be a list of layer widths, each at least 1"
+    elif start.boost.alpha == SEARCH and learner.learning_starts + 1 < LEAST:
+        key, value = "algorithm.learning_starts", learner.learning_starts
+        why = f"must be at least {LEAST - 1}: a line search needs {LEAST} transitions"
     elif start.initial is not ZERO and chosen.transfers != (warm_start,):
         key, value = "transfer", chosen.transfer
         why = "sets `initial`, but DQN needs networks there: set `base` or `prior`"

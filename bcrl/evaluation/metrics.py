@@ -16,6 +16,7 @@ from bcrl.learning import Booleans, Floats, Integers, rollout
 from bcrl.learning.fqi import Iteration
 from bcrl.learning.line_search import Searched
 from bcrl.learning.stage import Snapshot
+from bcrl.results.layout import SCALE
 
 
 class View(NamedTuple):
@@ -82,8 +83,10 @@ class SeedProbe:
         rows: list[dict[str, float]] = [place | own for own in self.measure(snapshot)]
         if stage.rescales:
             found = found or Searched.fixed(np.nan, len(rows))
-            pairs = zip(rows, found.alpha.tolist(), found.base_fit.tolist(), strict=True)
-            rows = [row | {"alpha": a, "base_fit": fit} for row, a, fit in pairs]
+            for row, *scale in zip(
+                rows, found.alpha.tolist(), found.base_fit.tolist(), strict=True
+            ):
+                row |= zip(SCALE, scale, strict=True)
         return rows
 
     def shown(self, episodes: rollout.Episodes, s: int, e: int) -> dict[str, NDArray]:

@@ -19,7 +19,6 @@ from bcrl.learning.replay import Replay, batched, one_by_one
 from bcrl.learning.rollout import CHOICES
 from bcrl.learning.stage import Pause, SeedBatch, Stage, StepSnapshot
 from bcrl.learning.transfer import (
-    SEARCH,
     Acting,
     PolicyReuse,
     ResidualPolicy,
@@ -48,7 +47,7 @@ class DQNState:
     step: int = 0  # steps done in this stage
     residual: Any = None  # (S, A) ϱ at `env_state`, if computed
     searched: Searched | None = None  # of the base; None: not yet, or α is 1
-    #: Reward, absorbing, next base and base of each step so far, until α is searched.
+    #: What `_target` takes of each step so far, until α is searched.
     unscaled: list[tuple[Any, ...]] | None = None
 
 
@@ -97,7 +96,7 @@ class DQNTrainer:
         alpha = self.start.boost.alpha
         if self.start.base is ZERO or alpha == 1.0:
             return DQNState(*begun)
-        if alpha == SEARCH:
+        if isinstance(alpha, str):
             return DQNState(*begun, unscaled=[])
         return DQNState(*begun, searched=Searched.fixed(alpha, n))
 
@@ -117,6 +116,7 @@ class DQNTrainer:
         next_state, reward, absorbing, cut = result
         base, potential, _ = self._frozen
         frozen = next_base, next_potential, _ = self._frozen_at(next_state)
+        bonus: Any = 0.0
         if start.shape is not None:
             before = getattr(env, "before_reset", None)
             if before and start.shape.next_state == "before_reset":
@@ -124,11 +124,10 @@ class DQNTrainer:
                 next_potential = self._values(start.potential, left)
             v, next_v = potential.max(-1), next_potential.max(-1)
             zero = start.shape.zero_at_goal
-            reward = reward + shaping(v, next_v, absorbing, env.gamma, zero)
+            bonus = shaping(v, next_v, absorbing, env.gamma, zero)
         now_base = base[np.arange(len(own)), own]
-        known = (reward, absorbing, next_base, now_base)
-        target = precompute_target(*known, env.gamma, start.boost)
-        now.replay.add(now.env_state, next_state, *target, own)
+        known = (reward, bonus, absorbing, next_base, now_base)
+        now.replay.add(now.env_state, next_state, *self._target(*known), own)
         if now.unscaled is not None:
             now.unscaled.append(known)
         now.steps_in_episode += 1
@@ -188,19 +187,26 @@ class DQNTrainer:
         own = np.where(few & (u[..., 0] >= epsilon), advised, own)
         return own, self._combined[advised, own]
 
+    def _target(self, reward: Floats, bonus: Any, *rest: Any) -> tuple[Floats, ...]:
+        """See `precompute_target`; `bonus` is what shaping adds to the rewards."""
+        known = (reward + bonus, *rest, self.env.gamma, self.start.boost)
+        return precompute_target(*known)
+
     def _search(self) -> None:
         """Choose each seed's α by the transitions so far, and restate their targets."""
-        now, gamma = self.state, self.env.gamma
+        now, start = self.state, self.start
         columns = zip(*now.unscaled, strict=True)
-        reward, absorbing, after, base = (np.stack(x, 1) for x in columns)  # (S, n, …)
+        reward, bonus, absorbing, after, base = (np.stack(x, -1) for x in columns)
+        after = np.moveaxis(after, 1, 2)  # from (S, A, n); the others are (S, n)
         each = zip(reward, base, after, absorbing, strict=True)
-        found = Searched.of([search(*own, gamma) for own in each])
+        gamma = self.env.gamma
+        found = Searched.of([search(*own, gamma, robust=True) for own in each])
         alpha = found.alpha[:, None]
-        known = (reward, absorbing, alpha[..., None] * after, alpha * base)
-        target = precompute_target(*known, gamma, self.start.boost)
-        now.replay.restate(*target[:2])
+        bonus = alpha * bonus if start.potential is start.base else bonus
+        known = (reward, bonus, absorbing, alpha[..., None] * after, alpha * base)
+        now.replay.restate(*self._target(*known)[:2])
         now.searched, now.unscaled = found, None
-        self.start = self.start.rescaled(found.alpha)
+        self.start = start.rescaled(found.alpha)
         self._frozen = self._frozen_at(now.env_state)
 
     def update(self) -> None:

@@ -18,7 +18,7 @@ from bcrl.learning.agent import Agent
 from bcrl.learning.policies import combined_actions
 from bcrl.learning.transfer import Acting
 from bcrl.q.forest.forest import Forest
-from bcrl.q.functions import ZERO, Q, Shaped, Sum, Table
+from bcrl.q.functions import ZERO, Q, Scaled, Shaped, Sum, Table
 from bcrl.q.quadratic import Quadratic
 from bcrl.q.regressors.base import FittedQ
 
@@ -78,6 +78,8 @@ def _described(q: Q, put: Put) -> Any:
         return {"sum": []}
     if isinstance(q, Sum):
         return {"sum": [_described(term, put) for term in q.terms]}
+    if isinstance(q, Scaled):
+        return {"scaled": {"factor": float(q.factor[0]), "q": _described(q.q, put)}}
     if isinstance(q, Shaped):
         parts = {"base": q.base, "residual": q.residual, "potential": q.potential}
         return {"shaped": {name: _described(part, put) for name, part in parts.items()}}
@@ -148,6 +150,8 @@ def _onnx(agent: Agent) -> bytes:
     def _values(q: Q) -> str:
         if isinstance(q, Sum):
             return total(q.terms)
+        if isinstance(q, Scaled):
+            return node("Mul", values(q.q), constant(q.factor))
         if isinstance(q, Shaped):
             own, axes = total((q.base, q.residual)), constant(np.array([1]))
             return node("Add", own, node("ReduceMax", values(q.potential), axes))

@@ -14,7 +14,7 @@ from bcrl.learning.bellman import residual_target, shaping
 from bcrl.learning.dataset import Dataset
 from bcrl.learning.line_search import Searched, search
 from bcrl.learning.stage import Pause, SeedBatch, Snapshot, Stage
-from bcrl.learning.transfer import SEARCH, StageInit, StageResult
+from bcrl.learning.transfer import StageInit, StageResult
 from bcrl.learning.transitions import Logged, transitions_of
 from bcrl.q.functions import NOT_FINITE, ZERO, Q, Table, Values, query
 from bcrl.q.regressors.base import Cell, Fitted, FittedQ, Problem, Regressor, fit_each
@@ -82,16 +82,18 @@ class FQI:
             return values
 
         base = at_points(start.base)
+        searched = self._scales(start, base, data, env.gamma)
+        if searched is not None:
+            start = start.rescaled(searched.alpha)
+            base = [a * q for a, q in zip(searched.alpha, base, strict=True)]
+        same = start.potential is start.base
+        value = base if same else at_points(start.potential)
+        potential = [v.max(-1) for v in value]  # S arrays (P,)
         residual = state.residual or at_points(start.initial)
-        potential = [v.max(-1) for v in at_points(start.potential)]  # S arrays (P,)
         reward = [  # S arrays (n,)
             d.reward + shaping(v[d.state], v[d.next_state], d.absorbing, env.gamma)
             for d, v in zip(data, potential, strict=True)
         ]
-        searched = self._scales(start, base, reward, data, env.gamma)
-        if searched is not None:
-            start = start.rescaled(searched.alpha)
-            base = [a * q for a, q in zip(searched.alpha, base, strict=True)]
         models: list[list[Fitted | None]] = [[None] * n_actions for _ in data]
         if isinstance(start.initial, FittedQ):
             models = [list(row) for row in start.initial.models]
@@ -149,7 +151,6 @@ class FQI:
         self,
         start: StageInit,
         base: Sequence[Floats],
-        reward: Sequence[Floats],
         data: Sequence[Dataset],
         gamma: float,
     ) -> Searched | None:
@@ -157,13 +158,13 @@ class FQI:
         alpha = start.boost.alpha
         if start.base is ZERO or alpha == 1.0:
             return None
-        if alpha != SEARCH:
+        if not isinstance(alpha, str):
             return Searched.fixed(alpha, len(data))
-        each = zip(data, base, reward, strict=True)
-        return Searched.of([
-            search(r, q[d.state, d.action], q[d.next_state], d.absorbing, gamma, d.multiplicity)
-            for d, q, r in each
-        ])
+        found = []
+        for d, q in zip(data, base, strict=True):
+            known = d.reward, q[d.state, d.action], q[d.next_state], d.absorbing
+            found.append(search(*known, gamma, d.multiplicity))
+        return Searched.of(found)
 
     def _collect(self, stage: Stage, start: StageInit, batch: SeedBatch) -> FQIState:
         """The state before the first iteration, with a dataset for each seed."""

@@ -62,10 +62,11 @@ class Boost:
     alpha: float | Literal["search"] = 1.0
 
     def __post_init__(self) -> None:
-        number = isinstance(self.alpha, Real) and not isinstance(self.alpha, bool)
-        if self.alpha != SEARCH and not (number and 0.0 <= self.alpha < math.inf):
+        alpha: Any = self.alpha
+        number = isinstance(alpha, Real) and not isinstance(alpha, bool)
+        if alpha != SEARCH and not (number and 0.0 <= alpha < math.inf):
             why = "must be a number of at least 0, or search"
-            raise ConfigError("boosting.alpha", self.alpha, why)
+            raise ConfigError("boosting.alpha", alpha, why)
 
     def __call__(self, start: "StageInit", previous: StageResult) -> "StageInit":
         return replace(start, base=previous.q, boost=self)
@@ -141,8 +142,13 @@ class StageInit:
         return Shaped(self.base, residual, self.potential)
 
     def rescaled(self, alpha: Floats) -> "StageInit":
-        """The same with each seed's base times its entry of `alpha` (S,)."""
-        return replace(self, base=Scaled(self.base, alpha))
+        """The same with each seed's base times its entry of `alpha` (S,).
+
+        The potential has the base's scale if both are the same Q-function (SBC-).
+        """
+        base = Scaled(self.base, alpha)
+        same = self.potential is self.base
+        return replace(self, base=base, potential=base if same else self.potential)
 
     def memoized(self) -> "StageInit":
         """The same with a base and a potential that cache their values."""

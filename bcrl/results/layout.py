@@ -38,6 +38,8 @@ DQN_METRICS = (
     *("greedy_return", "greedy_discounted_return", "greedy_success_rate"),
 )
 MAY_BE_NAN = ("q_mean", "loss")  # those with nothing to average at times
+#: The last columns of runs that change the scale of the base (boosting.alpha).
+SCALE = ("alpha", "base_fit")
 SETTING = "learner."  # in a frame of `bcrl.api.run`: columns of a learner's settings
 
 

@@ -27,7 +27,9 @@ def parsed(path: Path, data: bytes, document: Document) -> pd.DataFrame:
     if family == "FQI":
         metrics = tuple(dict.fromkeys(document["config"]["env"]["metrics"]))
         finite = {*layout.FQI_METRICS.get(document["env"], ())}
-    expected = [str(column) for column in (*layout.INDEX[family], *metrics)]
+    alpha = document["config"].get("boosting", {}).get("alpha", 1.0)
+    scale = layout.SCALE if alpha != 1.0 else ()
+    expected = [str(column) for column in (*layout.INDEX[family], *metrics, *scale)]
     if list(table.columns) != expected:
         found = ",".join(table.columns)
         raise Finding(path, f"has the header {found}, expected {','.join(expected)}")

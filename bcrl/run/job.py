@@ -99,6 +99,8 @@ class _Training:
         self.rows: list[list[dict[str, Any]]] = [[] for _ in seeds]  # of the CSVs
         self.residuals: list[Q] = []  # ϱ of the stages that an agent keeps
         self.failed: dict[int, str] = {}  # by place in the batch
+        #: By place and stage: why the scale of the base could not be searched.
+        self.notes: dict[int, dict[int, str]] = {}
         self.interruptions = 0
         self._began = _clocks()  # minus what was spent before an interruption
         self._path = checkpoints.checkpoint_path(plan, seeds)
@@ -106,7 +108,7 @@ class _Training:
             stored = read_content(self._path, self.run.given, plan.device)
             self.run.state = stored["past"]
             self.probe.kept, self.failed = stored["kept"], stored["failed"]
-            self.residuals = stored["residuals"]
+            self.residuals, self.notes = stored["residuals"], stored["notes"]
             self.rows, self.interruptions = json.loads(stored["rows"]), stored["stops"]
             self._began -= stored["spent"]
             log(self.rows)
@@ -158,6 +160,9 @@ class _Training:
         for place, why in self.probe.failed.items():
             self.failed.setdefault(place, f"{why} at {index} {snapshot.count}")
         if snapshot.last_of_stage:
+            found = snapshot.searched.reasons if snapshot.searched else {}
+            for place, why in found.items():
+                self.notes.setdefault(place, {})[snapshot.stage.number] = why
             earlier = self.residuals if self._keeps_all else []
             self.residuals = [*earlier, snapshot.result.residual]
 
@@ -171,7 +176,8 @@ class _Training:
         rows = json.dumps(self.rows)  # faster and smaller as one text
         content = {"past": past, "kept": self.probe.kept, "rows": rows}
         content |= {"residuals": self.residuals, "spent": _clocks() - self._began}
-        return content | {"failed": self.failed, "stops": self.interruptions}
+        content |= {"failed": self.failed, "notes": self.notes}
+        return content | {"stops": self.interruptions}
 
     def _check_locks(self) -> None:
         """BcrlError if the folder, and with it the locks, was taken away."""
@@ -201,12 +207,14 @@ class _Training:
                 failed[seed], status = why, f"failed: {why}"
                 say(f"{plan.env} {plan.name}: seed {seed} {status}")
             agent, own = self._agent(place) if seed not in failed else (None, {})
+            if notes := self.notes.get(place):
+                own |= {"line_search": notes}
             found = self.rows[place], arrays[place], facts | own, agent
             self._check_locks()
             records.write_seed(plan, seed, status, *found)
         return failed
 
-    def _agent(self, place: int) -> tuple[bytes | None, dict[str, str]]:
+    def _agent(self, place: int) -> tuple[bytes | None, dict[str, Any]]:
         """The agent's file of the seed at `place`; without one, why there is none."""
         result = self.run.state.result
         if self.plan.config["keep"] == "none" or result is None:

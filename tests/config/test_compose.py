@@ -139,6 +139,7 @@ def test_every_experiment_and_every_scale_composes():
 
 
 RELEASED = (Boost("residual", "two", False), Shape("before_reset", False))
+SEARCHED = (Boost(alpha="search"), Shape())
 #: Of each variant: its name, transfers, learners and last target_update.
 VARIANTS = {
     "plain": ("DQN", (warm_start,), [DQN], 200),
@@ -152,6 +153,9 @@ VARIANTS = {
     "BC_released": ("BC-DQN@released", RELEASED[:1], [LSPI, DQN], 2000),
     "SC_released": ("SC-DQN@released", RELEASED[1:], [LSPI, DQN], 4000),
     "SBC_released": ("SBC-DQN@released", RELEASED, [LSPI, DQN], 4000),
+    "B_line_search": ("B-DQN@line_search", SEARCHED[:1], [DQN, DQN], 2000),
+    "BC_line_search": ("BC-DQN@line_search", SEARCHED[:1], [LSPI, DQN], 2000),
+    "SBC_line_search": ("SBC-DQN@line_search", SEARCHED, [LSPI, DQN], 4000),
 }
 
 
@@ -165,7 +169,8 @@ def test_the_linear_systems_methods(variant):
     assert p.stages[-1].learner.target_update == target_update
     random = sum(getattr(s.learner, "random_steps", 0) for s in p.stages)
     assert p.length == 40_000 + random
-    assert random == (500 if variant in ("plain", "C", "SC", "SC_released", "B") else 0)
+    without = ("plain", "C", "SC", "SC_released", "B", "B_line_search")
+    assert random == (500 if variant in without else 0)
 
 
 def test_choosing_the_groups_is_the_same_as_naming_the_variant():

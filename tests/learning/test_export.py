@@ -11,7 +11,8 @@ from bcrl.errors import BcrlError
 from tests.run.runs import KINDS, run
 
 NETWORKS = ("dqn plain", "dqn BC", "dqn SBC", "dqn RPL", "dqn SBC_released")
-OTHERS = ("maze BC", "car_on_hill BC", "car_on_hill SC")
+NETWORKS += ("dqn SBC_line_search",)
+OTHERS = ("maze BC", "car_on_hill BC", "car_on_hill SC", "maze SBC_line_search")
 
 
 def states_of(agent):
@@ -33,6 +34,8 @@ def q_of(about, arrays, x):
     }
     if kind == "sum":
         return sum(q_of(term, arrays, x) for term in what)
+    if kind == "scaled":
+        return what["factor"] * q_of(what["q"], arrays, x)
     if kind == "shaped":
         base, own, v = (
             q_of(what[k], arrays, x) for k in ("base", "residual", "potential")

@@ -23,6 +23,7 @@ DQN = (*LINEAR, "seeds.count=2", "scale.max_steps=540", "algorithm.target_update
 DQN += ("algorithm.evaluation_episodes=3", "tag=x")
 METHODS = ("plain", "C", "B", "BC", "SC", "SBC", "RPL", "PPR")
 METHODS += ("BC_released", "SC_released", "SBC_released")
+METHODS += ("B_line_search", "BC_line_search", "SBC_line_search")
 HILL = ("env=car_on_hill", *FQI, "tag=x")
 SHORT = (*HILL, "env.horizon=20")
 LQ = ("env.tasks.task=[lq]", "env.tasks.horizon=[100]", "algorithm.steps=400")
@@ -32,7 +33,7 @@ CART = ("env.horizon=90", "scale.max_steps=150", "algorithm.learning_starts=60")
 KINDS = {
     f"{env} {name}": (f"env={env}", f"variant={name}", *FQI)
     for env in ("car_on_hill", "maze")
-    for name in ("plain", "C", "B", "BC", "SC", "SBC")
+    for name in ("plain", "C", "B", "BC", "SC", "SBC", "SBC_line_search")
 }
 KINDS |= {f"dqn {name}": (*DQN, f"variant={name}") for name in METHODS}
 KINDS["dqn RPL"] += ("transfer.offset=510",)
