@@ -52,10 +52,9 @@ class Stage:
     own_task: int = 0  # its position without the tasks of a source; 0: it is `task`
 
     @property
-    def rescales(self) -> bool:
-        """Whether the base has a factor other than 1."""
-        boosts = (t for t in self.transfers if isinstance(t, Boost))
-        return any(boost.alpha != 1.0 for boost in boosts)
+    def alpha(self) -> float | str:
+        """The factor of the base, or `search`; 1 without boosting."""
+        return next((t.alpha for t in self.transfers if isinstance(t, Boost)), 1.0)
 
 
 @dataclass(frozen=True)

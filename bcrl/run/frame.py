@@ -23,6 +23,7 @@ from bcrl.evaluation.metrics import Probe
 from bcrl.evaluation.step_metrics import StepProbe
 from bcrl.learning.fqi import FQI
 from bcrl.learning.stage import SeedBatch, Snapshot, Stage, learn
+from bcrl.learning.transfer import SEARCH
 from bcrl.q.regressors.ours import REGRESSORS
 from bcrl.results.layout import SETTING
 from bcrl.run.workers import do_jobs
@@ -118,7 +119,10 @@ def about(stages: Sequence[Stage]) -> tuple[str, dict[str, Any]]:
     last = stages[-1]
     target_only = all(stage.env == last.env for stage in stages)
     name = getattr(last.learner, "name", type(last.learner).__name__)
-    return method_name(name, last.transfers, target_only), _settings(last.learner)
+    method, alpha = method_name(name, last.transfers, target_only), last.alpha
+    if alpha != 1.0:
+        method += "@line_search" if alpha == SEARCH else f"@alpha={alpha:g}"
+    return method, _settings(last.learner)
 
 
 def _settings(thing: Any, prefix: str = SETTING) -> dict[str, Any]:

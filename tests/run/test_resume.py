@@ -28,7 +28,7 @@ from tests.conftest import plan
 from tests.run.runs import KINDS, MAZE, TABULAR, about, at_row, compared, run
 
 KILLS = int(os.environ.get("BCRL_KILLS", "0"))
-FEW = ("maze C", "car_on_hill C", "dqn C", "dqn SBC")
+FEW = ("maze C", "car_on_hill C", "dqn C", "dqn SBC", "dqn SBC_line_search")
 ROOT = Path(__file__).parents[2]
 
 
@@ -52,7 +52,7 @@ class Countdown(Stop):
 
 
 #: A kind of run, and after how many checks it stops.
-STOPS = [("maze BC", 5), ("dqn C", 330), ("dqn SBC", 180)]
+STOPS = [("maze BC", 5), ("dqn C", 330), ("dqn SBC_line_search", 180)]
 
 
 @pytest.mark.parametrize(("kind", "steps"), STOPS)

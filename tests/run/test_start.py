@@ -37,7 +37,9 @@ def test_fqi_in_two_runs_equals_the_curriculum_in_one(variant, tmp_path):
         assert (one.q(x) == other.q(x)).all()
 
 
-@pytest.mark.parametrize("variant", ["BC", "SC", "SBC_released", "RPL", "PPR", "C"])
+@pytest.mark.parametrize(
+    "variant", ["BC", "SC", "SBC_released", "SBC_line_search", "RPL", "PPR", "C"]
+)
 def test_dqn_in_two_runs_equals_the_curriculum_in_one(variant, tmp_path):
     words = (*DQN, f"variant={variant}")
     whole = run(tmp_path / "whole", *words)
