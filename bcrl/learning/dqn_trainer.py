@@ -198,8 +198,8 @@ class DQNTrainer:
         columns = zip(*now.unscaled, strict=True)
         reward, bonus, absorbing, after, base = (np.stack(x, -1) for x in columns)
         after = np.moveaxis(after, 1, 2)  # from (S, A, n); the others are (S, n)
-        each = zip(reward, base, after, absorbing, strict=True)
-        gamma = self.env.gamma
+        ends = absorbing & start.boost.mask_at_goal
+        each, gamma = zip(reward, base, after, ends, strict=True), self.env.gamma
         found = Searched.of([search(*own, gamma, robust=True) for own in each])
         alpha = found.alpha[:, None]
         bonus = alpha * bonus if start.potential is start.base else bonus

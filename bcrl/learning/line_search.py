@@ -117,9 +117,9 @@ def search(
         why = f"a line search needs {LEAST} transitions, here are {n}"
     elif not np.isfinite(gain).all():
         why = "the base is not finite on the data"
-    elif not gain.any():
+    elif not (gain * gain).any():
         why = "the base is zero on the data"
-    elif not reward.any():
+    elif not (reward * reward).any():
         why = "all rewards in the data are zero"
     if why:
         return 1.0, np.nan, f"alpha stays 1: {why}"

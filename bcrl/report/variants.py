@@ -148,10 +148,11 @@ class Runs:
         return {v.method: v for v in self.of(env, family) if v.tag == tag}
 
     def methods(self, env: str, tag: str | None, family: str = "FQI") -> Methods:
-        """The known methods of a tag. In the DQN family an untagged one stands in for
-        a method that has no run of a tag which others have."""
+        """The known methods of a tag. In the DQN family, and beside a line search, an
+        untagged one stands in for a method that has no run of a tag which others have.
+        """
         found = self.tagged(env, family, tag)
-        if found and family == "DQN":
+        if found and (family == "DQN" or tag == "line_search"):
             found = self.tagged(env, family, None) | found
         return {name: found[name] for name in FAMILIES[family] if name in found}
 
