@@ -44,6 +44,13 @@ def kept(function: Any = None, **options: Any) -> Any:
     return decorator if function is None else decorator(function)
 
 
+def instructions(function: Callable) -> Callable:
+    """A decorator: the function builds the LLVM code for calls of itself."""
+    from numba import extending  # a large import
+
+    return extending.intrinsic(function)
+
+
 def check() -> None:
     """Raise BcrlError if numba may not compile: some loops need it."""
     import numba  # a large import

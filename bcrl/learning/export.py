@@ -18,6 +18,7 @@ from bcrl.learning.agent import Agent
 from bcrl.learning.policies import combined_actions
 from bcrl.learning.transfer import Acting
 from bcrl.q.forest.forest import Forest
+from bcrl.q.forest.split import value_of
 from bcrl.q.functions import ZERO, Q, Scaled, Shaped, Sum, Table
 from bcrl.q.quadratic import Quadratic
 from bcrl.q.regressors.base import FittedQ
@@ -103,12 +104,11 @@ def _trees(model: Any) -> dict[str, NDArray]:
     if not isinstance(model, Forest):
         raise BcrlError(f"{type(model).__name__}: of trees, only our own are exported")
     nodes = model.nodes
-    keys, leaf = nodes["cut"], nodes["feature"] < 0
-    bits = keys ^ ((keys >> 31) & np.int32(2**31 - 1))  # `split.value_of`
+    leaf, cut = nodes["feature"] < 0, value_of.__wrapped__(nodes["cut"])  # not compiled
     value = np.where(leaf, model.values[np.where(leaf, nodes["child"], 0)], np.nan)
     return {
         "feature": nodes["feature"],
-        "threshold": np.where(leaf, np.float32(np.nan), bits.view(np.float32)),
+        "threshold": np.where(leaf, np.float32(np.nan), cut),
         "left": np.where(leaf, -1, nodes["child"]),  # the right child follows it
         "value": value,
         "roots": model.first[:-1],

@@ -45,6 +45,6 @@ def _plan(folder: Path, document: dict[str, Any], trust: Iterable[str]) -> Plan:
         named = dict(plugins.named_code(config)).get(error.key, "")
         package = re.split("[.:]", named)[0]
         if named and not plugins.is_trusted(package):
-            what = f"its config names code, {error.key}={named}; "
-            what += f"trust={package!r} lets it be imported"
+            what = f"its config names code, {error.key}={named}; trust={package!r} "
+            what += f"(bcrl-eval: --trust {package}) lets it be imported"
         raise BcrlError(f"{folder}: {what}") from None

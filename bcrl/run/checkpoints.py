@@ -23,12 +23,17 @@ _CODE = sha256(b"".join(_OURS) + repr([version(name) for name in LIBRARIES]).enc
 
 
 def save_checkpoint(
-    plan: Plan, seeds: Sequence[int], content: Any, given: Sequence[Any]
+    plan: Plan,
+    seeds: Sequence[int],
+    content: Any,
+    given: Sequence[Any],
+    kind: str = CHECKPOINT,
 ) -> None:
     """Store the batch's `content`, which refers to the objects of `given`."""
-    about, path = about_of(plan) | {"seeds": list(seeds)}, checkpoint_path(plan, seeds)
+    about = about_of(plan) | {"seeds": list(seeds)}
     write_atomically(
-        path, lambda to: serialization.write_content(to, about, content, given)
+        checkpoint_path(plan, seeds, kind),
+        lambda to: serialization.write_content(to, about, content, given),
     )
 
 

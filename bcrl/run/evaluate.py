@@ -1,7 +1,6 @@
 """`bcrl-eval`: episodes of the agents that a run has left, in its tasks or others."""
 
 import argparse
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -133,8 +132,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         _evaluate(_parser().parse_intermixed_args(arguments))
     except BcrlError as error:
-        why = re.sub(r"\btrust='(\S+)'", r"--trust \1", str(error))  # it was Python
-        say(f"bcrl-eval: {why}")
+        say(f"bcrl-eval: {error}")
         return 2
     return 0
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bcrl.common import serialization
-from bcrl.common.files import write_atomically, write_bytes
+from bcrl.common.files import write_bytes
 from bcrl.common.identity import identity
 from bcrl.config.plan import Plan, recorded, unusable_config
 from bcrl.errors import ConfigError
@@ -34,13 +34,7 @@ def keep(plan: Plan, run: CurriculumRun, content: dict[str, Any]) -> None:
         rows = [own[:-1] for own in rows]  # a longer run does not evaluate there
     content |= {"rows": json.dumps(rows), "kept": content["kept"][:-1]}
     content |= {"residuals": content["residuals"][:-1]}
-    seeds = run.batch.seeds
-    path = checkpoints.checkpoint_path(plan, seeds, STATE)
-    about = checkpoints.about_of(plan) | {"seeds": list(seeds)}
-    given = run.given
-    write_atomically(
-        path, lambda to: serialization.write_content(to, about, content, given)
-    )
+    checkpoints.save_checkpoint(plan, run.batch.seeds, content, run.given, STATE)
 
 
 def adopt(longer: Plan) -> None:

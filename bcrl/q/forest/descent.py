@@ -13,9 +13,8 @@ from numba import carray, types
 from numba.core.cgutils import get_or_insert_function
 from numpy.typing import NDArray
 
-from bcrl.common.compiling import compiled, kept
+from bcrl.common.compiling import compiled, instructions, kept
 from bcrl.q.forest.groups import GROUP, SHUFFLE, sift
-from bcrl.q.forest.lanes import instructions
 from bcrl.q.forest.split import LOW32, NODE, U, inlined, key_of, uncounted
 
 #: So many rows, and one more for SHARE nodes of a tree, are sorted faster than walked.

@@ -10,8 +10,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from bcrl.common.compiling import cpu_features
-from bcrl.q.forest.lanes import instructions
+from bcrl.common.compiling import cpu_features, instructions
 from bcrl.q.forest.split import U, inlined
 
 GROUP = 8

@@ -5,15 +5,14 @@ as LLVM vectors, which become SIMD instructions on any processor. Keys are padde
 whole vectors; nothing that is found in the padding is used.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic, models, register_model
+from numba.extending import models, register_model
 
-from bcrl.common.compiling import compiled
+from bcrl.common.compiling import compiled, instructions
 from bcrl.q.forest.split import (
     GOLDEN,
     LOW32,
@@ -27,9 +26,6 @@ from bcrl.q.forest.split import (
 
 LANES = 4  # of int32 keys in a vector; wide enough for AVX2, whose int64 sums are four
 CHUNK = U(128)  # rows that stay in the cache while all vectors of a row are read
-
-#: A function that builds LLVM code for calls of itself.
-instructions: Callable[[Callable], Callable] = intrinsic
 
 
 class Vector(types.Type):

@@ -5,15 +5,13 @@ few rows and columns is summed up over a list of terms. The order of a sum is th
 list's, whatever the processor: a float depends neither on others nor on the tile.
 """
 
-from collections.abc import Callable
 from itertools import chain
 
 from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
-from numba.extending import intrinsic
 
-from bcrl.common.compiling import cpu_features
+from bcrl.common.compiling import cpu_features, instructions
 
 _FEATURES = cpu_features()
 #: Rows of a tile and floats per vector. With eight rows, the loop reads addresses from
@@ -68,7 +66,7 @@ def _tile(width: int):
             b.store(b.load(total), end, align=4)
         return context.get_dummy_value()
 
-    @intrinsic
+    @instructions
     def tile(
         typing, out, rows, begin, last, column, terms, n_terms, a, across, along, right
     ):
@@ -97,11 +95,7 @@ def multiply(out, columns, rows, n_rows, terms, n_terms, a, across, along, right
                 _narrow(out, rows, *place, terms, n_terms, *factors)
 
 
-#: A function that builds LLVM code for calls of itself.
-_instructions: Callable[[Callable], Callable] = intrinsic
-
-
-@_instructions
+@instructions
 def turn(typing, slopes, units, turned, row, column):
     """Zero a square of slopes where their units are off, and write it transposed."""
 
