@@ -125,9 +125,11 @@ def report(
             text = text.to_csv(index=False, lineterminator="\n")
         files.append(write_text(out / name, text))
 
-    for family, stem in (("FQI", "aggregate"), ("DQN", "aggregate_dqn")):
+    for family, kind in (("FQI", ""), ("DQN", "dqn_")):
         if any(variant.family == family for variant in runs.variants):
-            write(f"{stem}_{runs.scale}.csv", tables.aggregate(runs, family))
+            end = f"{kind}{runs.scale}.csv"
+            write(f"aggregate_{end}", tables.aggregate(runs, family))
+            write(f"finals_{end}", tables.finals(runs, family))
     claims, compared = claims_sections(runs, tag), tables.sweep_table(runs)
     if claims:
         write(f"claims_{suffix}.md", claims_report(runs, tag, claims.values()))

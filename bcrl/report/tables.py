@@ -73,6 +73,17 @@ def aggregate(runs: Runs, family: str = "FQI") -> pd.DataFrame:
     return pd.concat(blocks, ignore_index=True)
 
 
+def finals(runs: Runs, family: str = "FQI") -> pd.DataFrame:
+    """What each seed ends with in the target: a row per variant and seed, a column per
+    metric (docs/reference/metrics.md), empty where a variant lacks it."""
+    blocks = []
+    for variant in (v for v in runs.variants if v.family == family):
+        index = {"env": variant.env, "variant": variant.name, "seed": variant.seeds}
+        own = {metric: variant.final(metric) for metric in variant.metrics}
+        blocks.append(pd.DataFrame(index | own))
+    return pd.concat(blocks, ignore_index=True)
+
+
 def sweep_table(runs: Runs) -> pd.DataFrame:
     """One row per variant of the methods that have more than one: settings as JSON,
     seeds, late and last return and success rate (nan if FQI lacks it), intervals."""

@@ -66,7 +66,8 @@ def test_both_figures_are_drawn(tmp_path, capsys, methods):
     write_dqn(tmp_path, methods, range(2))
     assert report(tmp_path, "--figures", "4a", "4b") == 0
     names = {f"figure_4{x}_smoke.{k}" for x in "ab" for k in ("png", "pdf")}
-    names |= {"aggregate_dqn_smoke.csv", "claims_smoke.md", "report_smoke.html"}
+    names |= {"aggregate_dqn_smoke.csv", "finals_dqn_smoke.csv"}
+    names |= {"claims_smoke.md", "report_smoke.html"}
     assert {p.name for p in (tmp_path / "figures").iterdir()} == names
     err = capsys.readouterr().err
     assert "skipped" not in err and ("no runs of" in err) == (methods != SEVEN)

@@ -14,7 +14,7 @@ from bcrl.report.claims import EXPECTED, UNEXPECTED, verdict
 from bcrl.report.figures import curves, style
 from bcrl.report.figures.maze import figure_3, seed_mean_value
 from bcrl.report.load import load_runs
-from bcrl.report.tables import aggregate
+from bcrl.report.tables import aggregate, finals
 from bcrl.report.variants import METHODS, remarks
 from bcrl.results import statistics as st
 from bcrl.results.layout import FQI_METRICS, seed_path
@@ -95,7 +95,8 @@ def test_intervals_of_curves_are_those_of_means(monkeypatch):
 @pytest.mark.slow
 def test_everything_is_written_listed_and_byte_identical(runs_dir, tmp_path, capsys):
     names = {f"figure_{n}_smoke.{k}" for n in "1235" for k in ("png", "pdf")}
-    names |= {"aggregate_smoke.csv", "claims_smoke.md", "report_smoke.html"}
+    names |= {"aggregate_smoke.csv", "finals_smoke.csv"}
+    names |= {"claims_smoke.md", "report_smoke.html"}
     for out in (tmp_path / "a", tmp_path / "b"):
         assert report(runs_dir, "--out", str(out)) == 0
         captured = capsys.readouterr()
@@ -142,6 +143,9 @@ def test_curves_and_aggregates_are_recomputed(written):
     expected = tables[:, 6, 1].std(ddof=1) / np.sqrt(6)
     assert row["standard_error"].item() == pytest.approx(expected)
     assert row[["stage", "task", "seeds"]].to_numpy().tolist() == [[3, 3, 6]]
+    ends = finals(runs).query("env == 'car_on_hill' and variant == 'BC-FQI'")
+    assert ends["seed"].tolist() == list(range(6))
+    assert ends["return"].to_numpy() == pytest.approx(tables[:, -1, 1])
 
 
 def test_values_are_of_the_seed_mean(runs_dir):
