@@ -100,6 +100,9 @@ def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
             _check_dqn(chosen, learner, start)
         elif isinstance(learner, LSPI):
             _check_slot(chosen, learner, slot, start)
+        elif start.boost.alpha != 1.0:
+            why = f"is for FQI and DQN; {type(learner).__name__} has the base as it is"
+            raise ConfigError("boosting.alpha", start.boost.alpha, why)
     if chosen.past and start.initial is not ZERO:
         given = chosen.past.learner
         if isinstance(learners[0], DQN) and not isinstance(given, DQN):

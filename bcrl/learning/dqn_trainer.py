@@ -254,7 +254,12 @@ class DQNTrainer:
         result = StageResult(q, now.deep, acting=self._acting())
         measured = (self._evaluated_policy, self.settings.evaluation_episodes, loss)
         failed |= now.lanes.failures  # each seed has one lane
-        more = {"searched": now.searched, "failed": failed}
+        searched = now.searched
+        if now.unscaled is not None and now.step == self.settings.length:
+            searched = Searched.fixed(
+                1.0, len(loss), "alpha stays 1: no update was made"
+            )
+        more = {"searched": searched, "failed": failed}
         return StepSnapshot(self.stage, count, now, result, *measured, **more)
 
     def _acting(self) -> Acting:

@@ -85,7 +85,9 @@ class FQI:
         searched = self._scales(start, base, data, env.gamma)
         if searched is not None:
             start = start.rescaled(searched.alpha)
-            base = [a * q for a, q in zip(searched.alpha, base, strict=True)]
+            for s in range(len(base)):
+                if s not in failed:  # its base may be infinite
+                    base[s] = searched.alpha[s] * base[s]
         same = start.potential is start.base
         value = base if same else at_points(start.potential)
         potential = [v.max(-1) for v in value]  # S arrays (P,)

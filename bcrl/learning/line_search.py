@@ -13,8 +13,8 @@ LEAST = 100  # transitions that a search needs
 #: The base keeps its own scale if that explains at least this share of what the best
 #: scale explains: if the best α is between 0.59 and 3.41.
 ENOUGH = 0.5
-#: A base must explain at least so many times what it would explain with its values
-#: shuffled among the states.
+#: The odds (explained / not explained) of the best scale must be at least so many times
+#: those by chance.
 SIGNIFICANT = 2.0
 ROUNDS = 100  # of repeated least squares
 
@@ -34,15 +34,15 @@ class Searched:
         return {s: why for s, why in enumerate(self.notes) if why}
 
     @classmethod
-    def fixed(cls, alpha: float, n_seeds: int) -> "Searched":
+    def fixed(cls, alpha: float, n_seeds: int, note: str = "") -> "Searched":
         """The same α for all seeds, not searched."""
-        return cls.of([(alpha, np.nan, "")] * n_seeds)
+        return cls.of([(alpha, np.nan, note)] * n_seeds)
 
     @classmethod
     def of(cls, seeds: Sequence[tuple[float, float, str]]) -> "Searched":
         """The results of `search`, one per seed."""
         alpha, fit, notes = zip(*seeds, strict=True)
-        return cls(np.array(alpha), np.array(fit), notes)
+        return cls(np.array(alpha, float), np.array(fit, float), notes)
 
 
 def best_scale(reward: Floats, gain: Floats, counts: Any = 1) -> float:
@@ -56,16 +56,16 @@ def best_scale(reward: Floats, gain: Floats, counts: Any = 1) -> float:
     return max(0.0, float((counts * reward * gain).sum()) / square)
 
 
-def robust_weights(reward: Floats, gain: Floats) -> Floats:
-    """Weights (n,) with which `best_scale` minimises Σ smooth-L1(reward − α · gain).
+def robust_weights(reward: Floats, gain: Floats, counts: Any = 1) -> Floats:
+    """`counts` times weights (n,) with which `best_scale` minimises DQN's loss.
 
-    That is DQN's loss. A jump, such as a fall back to the start, has a gain far above
-    the others; its square would decide about α alone. Found by repeated least squares.
+    The loss is Σ counts · smooth-L1(reward − α · gain). A jump, such as a fall back to
+    the start, has a gain far above the others; its square alone would decide about α.
     """
-    weights = np.ones(len(reward))
-    for _ in range(ROUNDS):
+    weights = counts * np.ones(len(reward))
+    for _ in range(ROUNDS):  # repeated least squares
         alpha = best_scale(reward, gain, weights)
-        weights = 1.0 / np.maximum(1.0, np.abs(reward - alpha * gain))
+        weights = counts / np.maximum(1.0, np.abs(reward - alpha * gain))
     return weights
 
 
@@ -91,6 +91,7 @@ def chance_fit(reward: Floats, base: Floats, after: Floats, counts: Any = 1) -> 
     return float((means[0] * gain) ** 2 / (square * (gain**2 + spread)))
 
 
+@np.errstate(over="ignore", invalid="ignore", under="ignore")
 def search(
     reward: Floats,
     base: Floats,
@@ -107,28 +108,35 @@ def search(
 
     A base that is nearly right keeps its scale, α = 1, since noise in the base shrinks
     the best scale: see ENOUGH. α is 0 with a note if the base explains no more than
-    chance: see SIGNIFICANT. α is 1 with a note if the base is zero or not finite on the
-    data, if all rewards are zero, or if there are fewer than LEAST transitions.
+    chance: see SIGNIFICANT. α is 1 with a note if rewards or base are zero or not
+    finite on the data, or if there are fewer than LEAST transitions.
     """
     after = gamma * np.where(absorbing, 0.0, next_base.max(-1))
-    gain, why = base - after, ""
-    n = int((counts * np.ones(len(reward))).sum())
+    gain = base - after
+    n, unit, own = int((counts * np.ones(len(reward))).sum()), 0.0, 0.0
+    if n:  # the squares of rewards and gains in these units are neither 0 nor infinite
+        unit, own = float(np.abs(reward).max()), float(np.abs(gain).max())
+    why = ""
     if n < LEAST:
         why = f"a line search needs {LEAST} transitions, here are {n}"
-    elif not np.isfinite(gain).all():
-        why = "the base is not finite on the data"
-    elif not (gain * gain).any():
+    elif not np.isfinite([unit, own]).all():
+        why = "the rewards or the base are not finite on the data"
+    elif not own:
         why = "the base is zero on the data"
-    elif not (reward * reward).any():
+    elif not unit:
         why = "all rewards in the data are zero"
     if why:
         return 1.0, np.nan, f"alpha stays 1: {why}"
+    gain = gain / own
     if robust:
-        counts = counts * robust_weights(reward, gain)
-    alpha = best_scale(reward, gain, counts)
-    best, own = (fit_of(each, reward, gain, counts) for each in (alpha, 1.0))
-    if best < SIGNIFICANT * chance_fit(reward, base, after, counts):
+        counts = robust_weights(reward, gain, counts)
+    reward = reward / unit
+    best = best_scale(reward, gain, counts)
+    fit = fit_of(best, reward, gain, counts)
+    chance = chance_fit(reward, base / own, after / own, counts)
+    chance += (1.0 - chance) * 2.0 / n  # what n transitions explain by accident
+    if fit * (1.0 - chance) < SIGNIFICANT * chance * (1.0 - fit):
         return 0.0, 0.0, "alpha is 0: the base explains no more than chance"
-    if own >= ENOUGH * best:
-        return 1.0, own, ""
-    return alpha, best, ""
+    if (unchanged := fit_of(own / unit, reward, gain, counts)) >= ENOUGH * fit:
+        return 1.0, unchanged, ""
+    return best * (unit / own), fit, ""

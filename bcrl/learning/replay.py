@@ -67,7 +67,6 @@ class Replay:
         """Replace these of all n transitions of each seed: (S, n, A) and (S, n)."""
         new = np.concatenate([next_base, fixed[..., None]], -1)
         self.rows[:, : self.size, 2 * self.d : -2] = torch.from_numpy(new)
-        self.valid[:] = False
 
     def indices(self, u: Floats, past: int = 0) -> NDArray[np.int64]:
         """Rows (T, S, B) that uniforms u (T, S, B) draw in T steps, with replacement.

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, ClassVar, Protocol
 
 from bcrl.common.serialization import storable
@@ -10,7 +11,7 @@ from bcrl.errors import BcrlError
 from bcrl.learning import Floats
 from bcrl.learning.line_search import Searched
 from bcrl.learning.rollout import Policy
-from bcrl.learning.transfer import Boost, StageInit, StageResult, Transfer, begin
+from bcrl.learning.transfer import Boost, StageInit, StageResult, Transfer, begin, tried
 from bcrl.q.functions import ZERO
 
 
@@ -51,9 +52,11 @@ class Stage:
     before: int  # iterations or environment steps of all previous stages
     own_task: int = 0  # its position without the tasks of a source; 0: it is `task`
 
-    @property
+    @cached_property
     def alpha(self) -> float | str:
         """The factor of the base, or `search`; 1 without boosting."""
+        if (start := tried(self.transfers)) is not None:
+            return start.boost.alpha
         return next((t.alpha for t in self.transfers if isinstance(t, Boost)), 1.0)
 
 

@@ -17,7 +17,7 @@ from bcrl.common.seed_axis import seeds_on
 from bcrl.common.serialization import storable
 from bcrl.errors import ConfigError, at_least
 from bcrl.learning import Floats
-from bcrl.q.functions import ZERO, Q, Scaled, Shaped, Sum, add, memoized
+from bcrl.q.functions import ZERO, Q, Shaped, Sum, add, memoized, scaled
 
 SEARCH = "search"  # a value of `Boost.alpha`
 
@@ -146,7 +146,7 @@ class StageInit:
 
         The potential has the base's scale if both are the same Q-function (SBC-).
         """
-        base = Scaled(self.base, alpha)
+        base = scaled(self.base, alpha)
         same = self.potential is self.base
         return replace(self, base=base, potential=base if same else self.potential)
 

@@ -90,11 +90,15 @@ def together(
     terms: Sequence[Q], states: Sequence[NDArray[np.float64]], n_actions: int
 ) -> list[Values]:
     """The values of each term, by the terms' own `together` if they are of one type."""
-    kinds = {type(term) for term in terms}
+    bare = [term.q if isinstance(term, Scaled) else term for term in terms]
+    kinds = {type(q) for q in bare}
     joint = getattr(kinds.pop(), "together", None) if len(kinds) == 1 else None
     if joint is not None:
-        return joint(terms, states, n_actions)
-    return [term(states, n_actions) for term in terms]
+        values = joint(bare, states, n_actions)
+    else:
+        values = [q(states, n_actions) for q in bare]
+    pairs = zip(terms, values, strict=True)
+    return [x.times(v, states) if isinstance(x, Scaled) else v for x, v in pairs]
 
 
 @storable
@@ -120,7 +124,10 @@ class Scaled:
     factor: NDArray[np.float64] = field(metadata=seeds_on(0))  # (S,)
 
     def __call__(self, states: Sequence[NDArray[np.float64]], n_actions: int) -> Values:
-        values = self.q(states, n_actions)
+        return self.times(self.q(states, n_actions), states)
+
+    def times(self, values: Values, states: Sequence[NDArray]) -> Values:
+        """The factors times the values of `q`."""
         return each(states, lambda s: self.factor[s] * values[s])
 
 
@@ -158,6 +165,15 @@ class Shaped:
         same = self.potential is self.base  # queried once: it may be stacked itself
         v = base if same else self.potential(states, n_actions)
         return each(states, lambda s: base[s] + own[s] + v[s].max(-1, keepdims=True))
+
+
+def scaled(q: Q, factor: NDArray[np.float64]) -> Q:
+    """q times factors (S,), term by term, so that a sum stays a flat one."""
+    if isinstance(q, Sum):
+        return Sum(tuple(scaled(term, factor) for term in q.terms))
+    if isinstance(q, Scaled):
+        return Scaled(q.q, factor * q.factor)
+    return Scaled(q, factor)
 
 
 def add(base: Q, residual: Q) -> Q:

@@ -28,7 +28,8 @@ def parsed(path: Path, data: bytes, document: Document) -> pd.DataFrame:
         metrics = tuple(dict.fromkeys(document["config"]["env"]["metrics"]))
         finite = {*layout.FQI_METRICS.get(document["env"], ())}
     alpha = document["config"].get("boosting", {}).get("alpha", 1.0)
-    scale = layout.SCALE if alpha != 1.0 else ()
+    own = {*layout.SCALE} <= {*table.columns}  # a user's transfer may have changed it
+    scale = layout.SCALE if alpha != 1.0 or own else ()
     expected = [str(column) for column in (*layout.INDEX[family], *metrics, *scale)]
     if list(table.columns) != expected:
         found = ",".join(table.columns)

@@ -121,7 +121,7 @@ def about(stages: Sequence[Stage]) -> tuple[str, dict[str, Any]]:
     name = getattr(last.learner, "name", type(last.learner).__name__)
     method, alpha = method_name(name, last.transfers, target_only), last.alpha
     if alpha != 1.0:
-        method += "@line_search" if alpha == SEARCH else f"@alpha={alpha:g}"
+        method += "@line_search" if alpha == SEARCH else f"@alpha={alpha}"
     return method, _settings(last.learner)
 
 

@@ -99,7 +99,7 @@ class _Training:
         self.rows: list[list[dict[str, Any]]] = [[] for _ in seeds]  # of the CSVs
         self.residuals: list[Q] = []  # ϱ of the stages that an agent keeps
         self.failed: dict[int, str] = {}  # by place in the batch
-        #: By place and stage: why the scale of the base could not be searched.
+        #: By stage and place: why the scale of the base could not be searched.
         self.notes: dict[int, dict[int, str]] = {}
         self.interruptions = 0
         self._began = _clocks()  # minus what was spent before an interruption
@@ -160,9 +160,8 @@ class _Training:
         for place, why in self.probe.failed.items():
             self.failed.setdefault(place, f"{why} at {index} {snapshot.count}")
         if snapshot.last_of_stage:
-            found = snapshot.searched.reasons if snapshot.searched else {}
-            for place, why in found.items():
-                self.notes.setdefault(place, {})[snapshot.stage.number] = why
+            if snapshot.searched is not None:
+                self.notes[snapshot.stage.number] = snapshot.searched.reasons
             earlier = self.residuals if self._keeps_all else []
             self.residuals = [*earlier, snapshot.result.residual]
 
@@ -207,8 +206,8 @@ class _Training:
                 failed[seed], status = why, f"failed: {why}"
                 say(f"{plan.env} {plan.name}: seed {seed} {status}")
             agent, own = self._agent(place) if seed not in failed else (None, {})
-            if notes := self.notes.get(place):
-                own |= {"line_search": notes}
+            notes = {n: own[place] for n, own in self.notes.items() if place in own}
+            own |= {"line_search": notes} if notes else {}
             found = self.rows[place], arrays[place], facts | own, agent
             self._check_locks()
             records.write_seed(plan, seed, status, *found)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from bcrl.api import Boost, Shape
+from bcrl.api import Boost, Shape, stages
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.envs.maze import Maze
 from bcrl.errors import ConfigError
@@ -17,7 +17,7 @@ from bcrl.learning.line_search import LEAST, best_scale, fit_of, robust_weights,
 from bcrl.learning.rollout import rollout
 from bcrl.learning.stage import SeedBatch, Stage, learn
 from bcrl.learning.transfer import StageInit, StageResult, begin
-from bcrl.q.functions import Scaled, Sum, Table, add
+from bcrl.q.functions import Scaled, Sum, Table, add, scaled
 from bcrl.q.regressors.ours import ForestRegressor, Tabular
 from tests.learning.test_transfer import Known, run_of
 from tests.toys import Corridor, last, snapshots, staged
@@ -93,23 +93,55 @@ def test_a_base_that_is_nearly_right_stays_as_it_is(scale):
     reward = base - GAMMA * np.where(absorbing, 0.0, next_base.max(-1))
     known = reward, base / scale, next_base / scale, absorbing
     alpha, fit, _ = search(*known, GAMMA)
-    assert alpha == 1.0 and 0.5 <= fit == fit_of(1.0, reward, reward / scale)
+    assert alpha == 1.0 and fit >= 0.5
+    assert fit == pytest.approx(fit_of(1.0, reward, reward / scale))
+
+
+@pytest.mark.parametrize("gamma", [0.5, 0.95, 0.99])
+@pytest.mark.parametrize("robust", [False, True])
+def test_an_exact_base_is_kept_where_all_rewards_are_equal(gamma, robust):
+    """Its values vary little, so that shuffled they would explain much, too."""
+    steps = np.tile(np.arange(int(4 / (1 - gamma)), int(8 / (1 - gamma))), 20)
+    base, after = (-(1 - gamma**n) / (1 - gamma) for n in (steps, steps - 1))
+    known = base, np.stack([after, after - 1.0], 1), steps == 1
+    reward = np.full(len(steps), -1.0)
+    assert search(reward, *known, gamma, robust=robust)[0] == 1.0
+    noise = np.random.default_rng(0).permutation(base), known[1], known[2]
+    assert search(reward, *noise, gamma, robust=robust)[0] == 0.0
+
+
+@pytest.mark.parametrize("unit", [1e-170, 1e-3, 1e160])
+def test_any_unit_of_rewards_and_bases_gives_the_same(unit):
+    reward, base, next_base, absorbing = sample()
+    reward = 0.3 * (base - GAMMA * np.where(absorbing, 0.0, next_base.max(-1)))
+    known = unit * base, unit * next_base, absorbing, GAMMA
+    with np.errstate(all="raise"):
+        assert search(reward, *known)[0] == pytest.approx(0.3 / unit)
+        alpha, fit, _ = search(unit * reward, base, next_base, absorbing, GAMMA)
+    assert (alpha, fit) == (pytest.approx(0.3 * unit), pytest.approx(1.0))
 
 
 def test_noise_and_a_base_of_the_opposite_sign_are_left_out():
     reward, base, next_base, absorbing = sample(100_000)
     alpha, fit, note = search(reward + 1.0, base, next_base, absorbing, GAMMA)
     assert (alpha, fit) == (0.0, 0.0) and "chance" in note
+    kept = 0
+    for seed in range(200):  # rewards of mean 0
+        data = sample(500, seed)
+        kept += search(*data, GAMMA)[0] > 0.0
+    assert kept < 20
     gain = base - GAMMA * np.where(absorbing, 0.0, next_base.max(-1))
     assert search(-gain, base, next_base, absorbing, GAMMA)[:2] == (0.0, 0.0)
 
 
-@pytest.mark.parametrize("what", ["few", "zero", "nan", "unrewarded"])
+@pytest.mark.parametrize("what", ["few", "zero", "nan", "inf", "unrewarded", "lost"])
 def test_where_nothing_can_be_searched_alpha_is_1_with_a_note(what):
     reward, base, next_base, absorbing = sample(LEAST - (what == "few"))
-    factor = {"zero": 0.0, "nan": np.nan}.get(what, 1.0)
-    reward = reward * (what != "unrewarded")
-    alpha, fit, note = search(reward, factor * base, factor * next_base, absorbing, 0.9)
+    factor = {"zero": 0.0, "nan": np.nan, "inf": np.inf}.get(what, 1.0)
+    reward = reward * {"unrewarded": 0.0, "lost": np.nan}.get(what, 1.0)
+    base, next_base = factor * np.abs(base), factor * np.abs(next_base)
+    with np.errstate(all="raise"):
+        alpha, fit, note = search(reward, base, next_base, absorbing, GAMMA)
     assert alpha == 1.0 and np.isnan(fit) and note
 
 
@@ -182,6 +214,38 @@ def test_a_base_of_noise_gives_the_plain_algorithms_results():
     assert kept > 1.5 * plain
 
 
+@pytest.mark.parametrize("alpha", [0.5, 0.0, "search"])
+def test_a_seed_whose_base_is_infinite_fails_alone(alpha):
+    task, learner = Corridor(), FQI(2, 20, regressor=Tabular())
+    values = [np.zeros((6, 2)) - 1.0, np.full((6, 2), -np.inf)]
+    lost = Table(values, task)
+    stage, batch = staged(learner, task, 2), SeedBatch((0, 1), task.states())
+    start = begin((Boost(alpha=alpha),), StageResult(lost, lost))
+    start = replace(start, previous=None)
+    with np.errstate(all="raise"):
+        end = last(snapshots(learner.learn(stage, start, batch)))
+    assert [*end.failed] == [1] and np.isfinite(end.probed_q[0]).all()
+
+
+def test_only_fqi_and_dqn_apply_the_factor():
+    class Own:
+        name, length = "own", 1
+
+        def learn(self, stage, start, batch, state=None):
+            yield
+
+    with pytest.raises(ConfigError, match=r"boosting.alpha=search.* Own"):
+        stages([Corridor(), Corridor(2.0)], Own(), SEARCH)
+
+
+def test_a_wrapped_boost_is_known_by_what_it_does():
+    def own(start, previous):
+        return SEARCH(start, previous)
+
+    course = stages([Corridor(), Corridor(2.0)], FQI(1, regressor=Tabular()), own)
+    assert [stage.alpha for stage in course] == ["search", "search"]
+
+
 # --- DQN ---
 
 
@@ -244,8 +308,18 @@ def test_dqns_scale_is_each_seeds_own():
     assert fixed.factor.tolist() == [0.5, 0.5]
 
 
-def test_a_scaled_base_is_a_term_of_the_sum():
-    one = Scaled(Sum((Known(), Known(2))), np.array([2.0, 3.0]))
+def test_a_stage_without_an_update_says_that_it_did_not_search():
+    run = trained(SEARCH, steps=20)
+    assert run.snapshot().searched is None
+    run.state.step = run.settings.length
+    found = run.snapshot().searched
+    assert found.alpha.tolist() == [1.0, 1.0] and set(found.reasons) == {0, 1}
+
+
+def test_a_scaled_sum_stays_a_flat_one():
+    one = scaled(Sum((Known(), Known(2))), np.array([2.0, 3.0]))
+    assert [type(term) for term in add(one, Known()).terms] == [Scaled, Scaled, Known]
+    assert scaled(one, np.array([0.5, 1.0])).terms[1].factor.tolist() == [1.0, 3.0]
     states = np.random.default_rng(0).normal(size=(2, 5, 4))
     parts = [Known()(states, 8), Known(2)(states, 8), Known(1)(states, 8)]
     expected = np.array([2.0, 3.0])[:, None, None] * (parts[0] + parts[1]) + parts[2]
