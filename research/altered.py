@@ -1,12 +1,11 @@
 """Environments whose tasks can be altered: rewards, actions and goals."""
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bcrl.api import CarOnHill, LinearSystem, Maze, compiled_step
+from bcrl.api import CarOnHill, LinearSystem, Maze
 from bcrl.envs.base import Floats, Ints, Step, check_episodes
 from bcrl.envs.car_on_hill import MAX_POSITION, MAX_SPEED
 from bcrl.envs.linear_system import ACTIONS
@@ -99,18 +98,6 @@ class PointMass(Altered, LinearSystem):
         return self.judged(after, reward, absorbing)
 
 
-@compiled_step
-def _mountain_car(state, action, noise, force):
-    """One step of the state (position, velocity) in Gymnasium's units."""
-    position, velocity = state
-    velocity += (action - 1) * force - 0.0025 * math.cos(3.0 * position)
-    velocity = min(max(velocity, -0.07), 0.07)
-    position = min(max(position + velocity, -1.2), 0.6)
-    if position == -1.2 and velocity < 0.0:
-        velocity = 0.0
-    return (position, velocity), -1.0, False
-
-
 _LOW, _HIGH = np.array([-1.2, -0.07]), np.array([0.6, 0.07])
 
 
@@ -145,10 +132,15 @@ class _Car:
     def step(self, state: Floats, action: Ints, noise: Floats | None = None) -> Step:
         """One step of the car."""
         hidden = _LOW + 0.5 * (state + 1.0) * (_HIGH - _LOW)
-        hidden, reward, _ = _mountain_car(hidden, action, None, self.force)
-        position = hidden[..., 0]
-        arrived = position <= -1.2 if self.goal_left else position >= 0.5
-        return self._observed(hidden), reward, arrived
+        position, velocity = hidden[..., 0], hidden[..., 1]
+        pull = (action - 1.0) * self.force - 0.0025 * np.cos(3.0 * position)
+        velocity = np.clip(velocity + pull, _LOW[1], _HIGH[1])
+        position = np.clip(position + velocity, _LOW[0], _HIGH[0])
+        at_wall = position == _LOW[0]
+        velocity = np.where(at_wall, np.maximum(velocity, 0.0), velocity)
+        arrived = at_wall if self.goal_left else position >= 0.5
+        after = self._observed(np.stack([position, velocity], -1))
+        return after, np.full(position.shape, -1.0), arrived
 
     def evaluation_states(self) -> Floats:
         """Ten starts, evenly spaced, (10, 2)."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -16,6 +17,7 @@ from research.misleading_tasks import METHODS
 _COLOURS = matplotlib.colormaps["cividis"]  # its lightness rises: it serves in grey
 _LIMIT = 100.0  # % of plain's gain, from where on colours are the same
 _ROW = 0.5  # inches per scenario
+_FAR = 200.0  # % of plain's gain, where a panel ends at most
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
@@ -46,7 +48,8 @@ def figure_finals(table: pd.DataFrame) -> Figure:
             figure, [(m, {**look, "linestyle": ""}) for m, look in looks.items()]
         )
         figure.set_label(
-            "Final return minus plain's, % of plain's gain; bars: 95 % interval"
+            "Final return minus plain's, % of plain's gain; bars: 95 % interval; "
+            f"what lies beyond {_FAR:.0f} stands at the edge"
         )
     return figure
 
@@ -66,7 +69,8 @@ def _draw_finals(
             continue
         spread = 0.76 * (shown.index(method) + 0.5) / len(shown) - 0.38
         y = np.array([scenarios.index(x) for x in own.scenario]) + spread
-        x, low, high = (100 * own[c] for c in ("final", "final_low", "final_high"))
+        columns = (100 * own[c] for c in ("final", "final_low", "final_high"))
+        x, low, high = (values.clip(-_FAR, _FAR) for values in columns)
         error = np.maximum(0.0, np.nan_to_num(np.stack([x - low, high - x])))
         look = {**looks[method], "linestyle": "", "elinewidth": 0.8}
         axes.errorbar(x, y, xerr=error, **look)
@@ -102,9 +106,15 @@ def _draw_cells(axes: Axes, cells: pd.DataFrame) -> matplotlib.image.AxesImage:
     for y, x in np.ndindex(values.shape):
         text = f"{values[y, x]:.0f}" if np.isfinite(values[y, x]) else "–"
         dark = values[y, x] < 0.2 * _LIMIT
-        look = {"color": "white" if dark else "black", "fontsize": style.LABEL}
-        axes.text(x, y, text.replace("-", "−"), ha="center", va="center", **look)
+        place: dict[str, Any] = {
+            "ha": "center",
+            "va": "center",
+            "fontsize": style.LABEL,
+        }
+        colour = "white" if dark else "black"
+        axes.text(x, y, text.replace("-", "−"), color=colour, **place)
     axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
     axes.set_yticks(range(len(names)), names)
     axes.set(xlabel="target", ylabel="source")
+    axes.label_outer()
     return image

@@ -110,7 +110,8 @@ def _gains(
                 if frame is not None:
                     area = measure(frame, scale, setting.late, source == goal).area
                     cells.loc[source, goal] = (area - base).mean() / scale.gain
-        found[method] = cells
+        easier = {"helpful": "easier"}  # a task, not what it does
+        found[method] = cells.rename(index=easier, columns=easier)
     return found
 
 
@@ -135,7 +136,7 @@ def _verdicts(table: pd.DataFrame) -> str:
         own = table[(table.method == method) & (table.verdict != "")]
         if len(own):
             words = ("not worse", "undecided", "worse")
-            lowest = own.loc[own.final.idxmin()]
+            lowest = own.iloc[int(own.final.argmin())]
             worst = (
                 f"{_with_interval(lowest, 'final')}, {lowest.env}: {lowest.scenario}"
             )
@@ -185,7 +186,7 @@ def _environment(env: str, table: pd.DataFrame, scale: Scale) -> str:
 
 def _finals(found: Found, seeds: Sequence[int]) -> str:
     """CSV of the final return: a row per environment, scenario and seed."""
-    columns = {key: pd.Series(own.final, seeds) for key, own in found.items()}
+    columns = {key: pd.Series(own.final, list(seeds)) for key, own in found.items()}
     frame = pd.DataFrame(columns).rename_axis("seed")
     frame.columns = frame.columns.set_names(["env", "scenario", "method"])
     long = frame.stack(["env", "scenario"], future_stack=True)

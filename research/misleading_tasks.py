@@ -80,11 +80,9 @@ class Setting:
             # Random steps begin a stage without a policy; shaping gives none.
             random = dqn.random_steps if place == 0 or method == "SC" else 0
             slow = place == len(sources) and method not in ("plain", "C")
-            settings = {
-                "steps": length - random,
-                "target_update": 2000 if slow else 200,
-            }
-            found.append((task, replace(dqn, **settings)))
+            frequency = 2000 if slow else 200
+            own = replace(dqn, steps=length - random, target_update=frequency)
+            found.append((task, own))
         if lspi and method != "C":
             found[0] = sources[0], LSPI(steps=share)
         return found
