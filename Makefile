@@ -63,7 +63,7 @@ test-all: $(READY) ## all tests, with the fast ones' coverage of the package
 lint: $(READY) ## style, spelling, layers of imports, types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/codespell bcrl bench conf docs examples *.md
+	$(BIN)/codespell bcrl bench conf docs examples research *.md
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 
