@@ -9,6 +9,7 @@ import pytest
 from bcrl.api import DQN, Maze, stages
 from research import misleading, misleading_runs
 from research.altered import Hill, Lattice, MountainCar, PointMass
+from research.line_search import no_worse
 from research.misleading_measures import Scale, kept_gain, measure, scale_of, verdict
 from research.misleading_tasks import METHODS, ONLY, SETTINGS, smoke
 
@@ -132,3 +133,10 @@ def test_verdicts_of_made_up_numbers():
     noisy = 0.93 * gain + 0.3 * (gain.mean() - rng.permutation(gain)) * 5
     assert kept_gain(gain, noisy, plain).verdict == "keeps (interval)"
     assert kept_gain(plain - gain, gain, plain).verdict == "no gain"
+
+
+def test_the_line_searchs_verdicts():
+    assert no_worse((0.5, 9.0)) == "better"
+    assert no_worse((-4.9, 1.0)) == "no worse (equivalence)"
+    assert no_worse((-5.1, 0.0)) == "no difference shown"
+    assert no_worse((-9.0, -0.1)) == "worse"
