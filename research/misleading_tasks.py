@@ -66,8 +66,7 @@ class Setting:
         """Sources share a third of the steps, but LSPI needs only a fifteenth.
 
         LSPI learns the linear-quadratic task in the first slot, except for C, which
-        trains the same networks further. The target network is copied every 200 steps,
-        or every 2000 in the target of a method that boosts or shapes (paper, C.3).
+        trains the same networks further.
         """
         tasks = tasks[-1:] if method == "plain" else tasks
         sources = tasks[:-1]
@@ -79,10 +78,7 @@ class Setting:
         for place, (task, length) in enumerate(zip(tasks, lengths, strict=True)):
             # Random steps begin a stage without a policy; shaping gives none.
             random = dqn.random_steps if place == 0 or method == "SC" else 0
-            slow = place == len(sources) and method not in ("plain", "C")
-            frequency = 2000 if slow else 200
-            own = replace(dqn, steps=length - random, target_update=frequency)
-            found.append((task, own))
+            found.append((task, replace(dqn, steps=length - random)))
         if lspi and method != "C":
             found[0] = sources[0], LSPI(steps=share)
         return found
@@ -106,29 +102,29 @@ SETTINGS: dict[str, Setting] = {
             "irrelevant": (Hill(mass=0.8, irrelevant=True),),
             "order reversed": (Hill(mass=0.9), Hill(mass=0.8)),
         },
-        learner=FQI(12, episodes=300, regressor=_FOREST, evaluate_every=2),
-        total=24,
+        learner=FQI(20, episodes=300, regressor=_FOREST, evaluate_every=2),
+        total=40,
         late=1 / 4,
-        seconds=0.8,
+        seconds=1.3,
         matrix=("helpful", "goal moved", "reversed", "irrelevant"),
     ),
     "maze": Setting(
-        target=Lattice(height=0.45),
+        target=Lattice(height=0.35),
         sources={
-            "helpful": (Lattice(height=0.25),),
-            "goal moved": (Lattice(height=0.25, goal=(0.05, 0.95)),),
-            "mirrored": (Lattice(height=0.25, goal=(0.95, 0.05)),),
-            "reversed": (Lattice(height=0.25, order=(1, 0, 3, 2)),),
-            "rewards x0.01": (Lattice(height=0.25, scale=0.01),),
-            "rewards x100": (Lattice(height=0.25, scale=100.0),),
-            "rewards shifted": (Lattice(height=0.25, shift=2.0),),
-            "irrelevant": (Lattice(height=0.25, irrelevant=True),),
-            "order reversed": (Lattice(height=0.35), Lattice(height=0.25)),
+            "helpful": (Lattice(height=0.15),),
+            "goal moved": (Lattice(height=0.15, goal=(0.05, 0.95)),),
+            "mirrored": (Lattice(height=0.15, goal=(0.95, 0.05)),),
+            "reversed": (Lattice(height=0.15, order=(1, 0, 3, 2)),),
+            "rewards x0.01": (Lattice(height=0.15, scale=0.01),),
+            "rewards x100": (Lattice(height=0.15, scale=100.0),),
+            "rewards shifted": (Lattice(height=0.15, shift=2.0),),
+            "irrelevant": (Lattice(height=0.15, irrelevant=True),),
+            "order reversed": (Lattice(height=0.25), Lattice(height=0.15)),
         },
-        learner=FQI(24, episodes=500, epsilon=0.7, regressor=_FOREST, evaluate_every=4),
-        total=48,
+        learner=FQI(40, episodes=500, regressor=_FOREST, evaluate_every=4),
+        total=80,
         late=1 / 4,
-        seconds=0.2,
+        seconds=0.35,
         matrix=("helpful", "mirrored", "reversed", "irrelevant"),
     ),
     "mountain_car": Setting(
@@ -143,10 +139,10 @@ SETTINGS: dict[str, Setting] = {
             "irrelevant": (MountainCar(force=0.005, irrelevant=True),),
             "order reversed": (MountainCar(force=0.004), MountainCar(force=0.005)),
         },
-        learner=FQI(12, episodes=80, epsilon=0.5, regressor=_FOREST, evaluate_every=2),
-        total=24,
+        learner=FQI(20, episodes=80, regressor=_FOREST, evaluate_every=2),
+        total=40,
         late=1 / 4,
-        seconds=0.8,
+        seconds=1.3,
     ),
     "point_mass": Setting(
         target=PointMass(drift=_DRIFT),
@@ -161,10 +157,10 @@ SETTINGS: dict[str, Setting] = {
             "irrelevant": (PointMass(drift=_DRIFT, irrelevant=True),),
             "order reversed": (PointMass(drift=-0.15), PointMass(drift=0.0)),
         },
-        learner=DQN(hidden=(64, 64), learning_rate=3e-4),
-        total=30_000,
-        late=4 / 15,  # 8000 steps
-        seconds=1.3,
+        learner=DQN(hidden=(64, 64), learning_rate=3e-4, target_update=1000),
+        total=42_000,
+        late=4 / 21,  # 8000 steps
+        seconds=2.0,
     ),
 }
 

@@ -13,8 +13,9 @@ LEAST = 100  # transitions that a search needs
 #: The base keeps its own scale if that explains at least this share of what the best
 #: scale explains: if the best α is between 0.59 and 3.41.
 ENOUGH = 0.5
-#: The odds (explained / not explained) of the best scale must be at least so many times
-#: those by chance.
+#: The best scale must explain at least this share of the squared rewards, …
+WEAK = 0.25
+#: … and its odds (explained / not explained) must be so many times those by chance.
 SIGNIFICANT = 2.0
 ROUNDS = 100  # of repeated least squares
 
@@ -107,9 +108,9 @@ def search(
     `counts` says how often each transition occurs. `robust`: see `robust_weights`.
 
     A base that is nearly right keeps its scale, α = 1, since noise in the base shrinks
-    the best scale: see ENOUGH. α is 0 with a note if the base explains no more than
-    chance: see SIGNIFICANT. α is 1 with a note if rewards or base are zero or not
-    finite on the data, or if there are fewer than LEAST transitions.
+    the best scale: see ENOUGH. α is 0 with a note if the base explains little, or no
+    more than chance: see WEAK and SIGNIFICANT. α is 1 with a note if rewards or base
+    are zero or not finite on the data, or if there are fewer than LEAST transitions.
     """
     after = gamma * np.where(absorbing, 0.0, next_base.max(-1))
     gain = base - after
@@ -134,7 +135,8 @@ def search(
     best = best_scale(reward, gain, counts)
     fit = fit_of(best, reward, gain, counts)
     chance = chance_fit(reward, base / own, after / own, counts)
-    chance += (1.0 - chance) * 2.0 / n  # what n transitions explain by accident
+    if fit < WEAK:
+        return 0.0, 0.0, f"alpha is 0: the base explains only {fit:.3f} of the rewards"
     if fit * (1.0 - chance) < SIGNIFICANT * chance * (1.0 - fit):
         return 0.0, 0.0, "alpha is 0: the base explains no more than chance"
     if (unchanged := fit_of(own / unit, reward, gain, counts)) >= ENOUGH * fit:
