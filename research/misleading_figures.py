@@ -16,7 +16,7 @@ from research.misleading_tasks import METHODS
 
 _COLOURS = matplotlib.colormaps["cividis"]  # its lightness rises: it serves in grey
 _LIMIT = 100.0  # % of plain's gain, from where on colours are the same
-_ROW = 0.5  # inches per scenario
+_ROW = 0.36  # inches per scenario
 _FAR = 200.0  # % of plain's gain, where a panel ends at most
 
 
