@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 from bcrl.common.files import make_directory
+from bcrl.errors import BcrlError
 from research.misleading_runs import jobs_of, train
 from research.misleading_tasks import SETTINGS, smoke
 
@@ -37,9 +38,11 @@ def main(words: list[str] | None = None) -> int:
         return train(jobs, given.out, given.workers)
     from research.misleading_tables import write  # matplotlib is slow to import
 
-    make_directory(given.to, "--to")
-    for path in write(settings, jobs, given.out, given.to):
-        print(path)
+    try:
+        make_directory(given.to, "--to")
+        print(*write(settings, jobs, given.out, given.to), sep="\n")
+    except BcrlError as error:
+        parser.error(str(error))
     return 0
 
 

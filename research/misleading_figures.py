@@ -16,7 +16,7 @@ from research.misleading_tasks import METHODS
 
 _COLOURS = matplotlib.colormaps["cividis"]  # its lightness rises: it serves in grey
 _LIMIT = 100.0  # % of plain's gain, from where on colours are the same
-_ROW = 0.5  # inches per scenario
+_ROW = 0.36  # inches per scenario
 _FAR = 200.0  # % of plain's gain, where a panel ends at most
 
 
@@ -104,7 +104,7 @@ def _draw_cells(axes: Axes, cells: pd.DataFrame) -> matplotlib.image.AxesImage:
     values, names = cells.to_numpy(), [*cells.columns]
     image = axes.imshow(values, cmap=_COLOURS, vmin=-_LIMIT, vmax=_LIMIT, aspect="auto")
     for y, x in np.ndindex(values.shape):
-        text = f"{values[y, x]:.0f}" if np.isfinite(values[y, x]) else "–"
+        text = f"{round(float(values[y, x]))}" if np.isfinite(values[y, x]) else "–"
         dark = values[y, x] < 0.2 * _LIMIT
         place: dict[str, Any] = {
             "ha": "center",

@@ -87,18 +87,21 @@ def train(jobs: Sequence[Job], out: Path, workers: int) -> int:
     todo = [(job, str(job.path(out)), revision) for job in missing]
     for job in missing:
         make_directory(job.path(out).parent, "--out")
-    failures, stop = [], Stop()
-    total = round(sum(job.seconds for job in jobs))
-    done = total - round(sum(job.seconds for job in missing))
-    look = {"total": total, "initial": done, "unit": "s of CPU time"}
+    failures: list[str] = []
+    stop = Stop()
+    total = sum(job.seconds for job in jobs)
+    done = total - sum(job.seconds for job in missing)
+    shown = "{desc} {percentage:3.0f} %|{bar}| {elapsed}, {remaining} left"
+    look = {"total": total, "initial": done, "bar_format": shown}
     with stop.on_signals(), tqdm(**look) as bar:
         for number, failure in do_jobs(_run, todo, workers, lambda *_: None, stop):
             job = missing[number]
             bar.set_description_str(f"{job.env} {job.curriculum} {job.method}")
-            bar.update(round(job.seconds))
+            bar.update(job.seconds)
             if failure:
                 failures.append(f"{job.env}, {job.curriculum}, {job.method}: {failure}")
-    print(*failures, sep="\n")
+    for failure in failures:
+        print(failure)
     return EXIT_CODE if stop.requested else int(bool(failures))
 
 

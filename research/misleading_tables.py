@@ -30,6 +30,8 @@ _HEAD = """# Negative transfer, measured
 the verdicts. `python -m research.misleading table` writes this page. Differences from
 plain are shares of plain's own gain r1 − r0, in %, with 95 % intervals.
 """
+_FINALS = "![Final return by scenario and method](misleading_finals.png)\n"
+_MATRIX = "![Area gained by source and target task](misleading_matrix.png)\n"
 Found = dict[tuple[str, str, str], Measures]
 
 
@@ -40,30 +42,27 @@ def write(
     frames = load(jobs, out)
     found, scales = _measured(settings, frames)
     if not found:
-        raise BcrlError(f"--out {out}: has no files of plain with these settings")
+        why = "has no run with these settings and seeds in which plain gains something"
+        raise BcrlError(f"--out {out}: {why}; `run` makes them")
     table = summary(found, scales)
     revisions = sorted({str(x) for f in frames.values() for x in f.revision.dropna()})
     seeds = jobs[0].seeds
     facts = f"Seeds {seeds[0]} to {seeds[-1]}; {len(frames)} of {len(jobs)} jobs are "
-    parts = [
-        _HEAD,
-        f"{facts}complete. Revision: {', '.join(revisions) or 'unknown'}.\n",
-    ]
-    parts += [_verdicts(table), _kept(found)]
+    code = ", ".join(revisions) or "unknown"
+    parts = [_HEAD, f"{facts}complete. Revision: {code}.\n"]
+    gains = {e: _gains(e, s, frames) for e, s in settings.items() if s.matrix}
+    parts += [_verdicts(table), _kept(found), _FINALS, _MATRIX * bool(gains)]
     parts += [_environment(env, table, scales[env]) for env in scales]
-    lost = [env for env in settings if env not in scales]
-    parts += [f"Plain's gain is not above 0 or not known: {', '.join(lost)}.\n"] * bool(
-        lost
-    )
+    if lost := ", ".join(env for env in settings if env not in scales):
+        parts.append(f"Plain's gain is not above 0 or not known: {lost}.\n")
     files = [write_text(to / "misleading.md", "\n".join(parts))]
     text = table.to_csv(index=False, float_format="%.4g", lineterminator="\n")
     files.append(write_text(to / "misleading_measures.csv", text))
     files.append(write_text(to / "misleading.csv", _finals(found, seeds)))
     files += save(figure_finals(table), to, "misleading_finals")
-    gains = {e: _gains(e, s, frames) for e, s in settings.items() if s.matrix}
-    return files + (
-        save(figure_matrix(gains), to, "misleading_matrix") if gains else []
-    )
+    if gains:
+        files += save(figure_matrix(gains), to, "misleading_matrix")
+    return files
 
 
 def _measured(
@@ -121,7 +120,7 @@ def _rows(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _percent(value: float) -> str:
-    return f"{100 * value:.0f}".replace("-", "−") if np.isfinite(value) else "–"
+    return f"{round(100 * value)}".replace("-", "−") if np.isfinite(value) else "–"
 
 
 def _with_interval(row: Any, name: str) -> str:
