@@ -1,1 +1,1 @@
-"""Experiments that are not in the paper; each is a command of its own."""
+"""Experiments that are not in the paper; each is a separate command."""

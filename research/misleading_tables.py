@@ -9,6 +9,7 @@ import pandas as pd
 
 from bcrl.common.files import write_text
 from bcrl.errors import BcrlError
+from bcrl.report.tables import TextTable
 from research.misleading_figures import figure_finals, figure_matrix, save
 from research.misleading_measures import (
     Kept,
@@ -20,7 +21,7 @@ from research.misleading_measures import (
     summary,
 )
 from research.misleading_runs import Job, cell, load
-from research.misleading_tasks import ALONE, METHODS, ONLY, Setting
+from research.misleading_tasks import ALONE, IN_MATRIX, METHODS, ONLY, Setting
 
 #: A line search, and what it is compared with.
 _PAIRS = {f"{name} line search": name for name in ("B", "BC", "SBC")}
@@ -95,7 +96,7 @@ def _gains(
     """
     names = [*setting.matrix_tasks()]
     found = {}
-    for method in ("BC", "BC line search"):
+    for method in IN_MATRIX:
         cells = pd.DataFrame(np.nan, names, names)
         for goal in names:
             plain = frames.get((env, cell(goal, goal), "plain"))
@@ -115,8 +116,7 @@ def _gains(
 
 
 def _rows(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+    return str(TextTable([dict(zip(head, row, strict=True)) for row in rows]))
 
 
 def _percent(value: float) -> str:

@@ -84,6 +84,17 @@ class Setting:
         return found
 
 
+def _scenarios(
+    easy: Any, changes: Mapping[str, Mapping[str, Any]], shift: float, harder: Any
+) -> dict[str, tuple[Any, ...]]:
+    """Scenario → the sources: the easier task, changed in one respect each."""
+    every = {"helpful": {}, **changes}
+    every |= {"rewards x0.01": {"scale": 0.01}, "rewards x100": {"scale": 100.0}}
+    every |= {"rewards shifted": {"shift": shift}, "irrelevant": {"irrelevant": True}}
+    found = {name: (replace(easy, **change),) for name, change in every.items()}
+    return found | {"order reversed": (harder, easy)}
+
+
 _FOREST = Forest(trees=25)
 _DRIFT = -0.25
 _OPPOSITE = (2, 3, 0, 1, 7, 6, 5, 4)  # the action with the opposite force
@@ -92,16 +103,12 @@ _LQ = PointMass(task="lq", horizon=100)
 SETTINGS: dict[str, Setting] = {
     "hill": Setting(
         target=Hill(mass=1.0),
-        sources={
-            "helpful": (Hill(mass=0.8),),
-            "goal moved": (Hill(mass=0.8, goal_left=True),),
-            "reversed": (Hill(mass=0.8, order=(1, 0)),),
-            "rewards x0.01": (Hill(mass=0.8, scale=0.01),),
-            "rewards x100": (Hill(mass=0.8, scale=100.0),),
-            "rewards shifted": (Hill(mass=0.8, shift=0.1),),
-            "irrelevant": (Hill(mass=0.8, irrelevant=True),),
-            "order reversed": (Hill(mass=0.9), Hill(mass=0.8)),
-        },
+        sources=_scenarios(
+            Hill(mass=0.8),
+            {"goal moved": {"goal_left": True}, "reversed": {"order": (1, 0)}},
+            shift=0.1,
+            harder=Hill(mass=0.9),
+        ),
         learner=FQI(21, episodes=300, regressor=_FOREST, evaluate_every=2),
         total=42,
         late=1 / 4,
@@ -110,17 +117,16 @@ SETTINGS: dict[str, Setting] = {
     ),
     "maze": Setting(
         target=Lattice(height=0.35),
-        sources={
-            "helpful": (Lattice(height=0.15),),
-            "goal moved": (Lattice(height=0.15, goal=(0.05, 0.95)),),
-            "mirrored": (Lattice(height=0.15, goal=(0.95, 0.05)),),
-            "reversed": (Lattice(height=0.15, order=(1, 0, 3, 2)),),
-            "rewards x0.01": (Lattice(height=0.15, scale=0.01),),
-            "rewards x100": (Lattice(height=0.15, scale=100.0),),
-            "rewards shifted": (Lattice(height=0.15, shift=2.0),),
-            "irrelevant": (Lattice(height=0.15, irrelevant=True),),
-            "order reversed": (Lattice(height=0.25), Lattice(height=0.15)),
-        },
+        sources=_scenarios(
+            Lattice(height=0.15),
+            {
+                "goal moved": {"goal": (0.05, 0.95)},
+                "mirrored": {"goal": (0.95, 0.05)},
+                "reversed": {"order": (1, 0, 3, 2)},
+            },
+            shift=2.0,
+            harder=Lattice(height=0.25),
+        ),
         learner=FQI(42, episodes=500, regressor=_FOREST, evaluate_every=4),
         total=84,
         late=1 / 4,
@@ -129,16 +135,12 @@ SETTINGS: dict[str, Setting] = {
     ),
     "mountain_car": Setting(
         target=MountainCar(force=0.003),
-        sources={
-            "helpful": (MountainCar(force=0.005),),
-            "goal moved": (MountainCar(force=0.005, goal_left=True),),
-            "reversed": (MountainCar(force=0.005, order=(2, 1, 0)),),
-            "rewards x0.01": (MountainCar(force=0.005, scale=0.01),),
-            "rewards x100": (MountainCar(force=0.005, scale=100.0),),
-            "rewards shifted": (MountainCar(force=0.005, shift=2.0),),
-            "irrelevant": (MountainCar(force=0.005, irrelevant=True),),
-            "order reversed": (MountainCar(force=0.004), MountainCar(force=0.005)),
-        },
+        sources=_scenarios(
+            MountainCar(force=0.005),
+            {"goal moved": {"goal_left": True}, "reversed": {"order": (2, 1, 0)}},
+            shift=2.0,
+            harder=MountainCar(force=0.004),
+        ),
         learner=FQI(21, episodes=80, regressor=_FOREST, evaluate_every=2),
         total=42,
         late=1 / 4,

@@ -100,9 +100,9 @@ def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
             _check_dqn(chosen, learner, start)
         elif isinstance(learner, LSPI):
             _check_slot(chosen, learner, slot, start)
-        elif start.boost.alpha != 1.0:
+        elif start.alpha != 1.0:
             why = f"is for FQI and DQN; {type(learner).__name__} has the base as it is"
-            raise ConfigError("boosting.alpha", start.boost.alpha, why)
+            raise ConfigError("boosting.alpha", start.alpha, why)
     if chosen.past and start.initial is not ZERO:
         given = chosen.past.learner
         if isinstance(learners[0], DQN) and not isinstance(given, DQN):
@@ -160,7 +160,7 @@ def _check_dqn(chosen: Composition, learner: DQN, start: StageInit) -> None:
     elif not widths or not all(isinstance(w, Integral) and w >= 1 for w in widths):
         key, value = "algorithm.hidden", list(widths)
         why = "must be a list of layer widths, each at least 1"
-    elif start.boost.alpha == SEARCH and learner.learning_starts + 1 < LEAST:
+    elif start.alpha == SEARCH and learner.learning_starts + 1 < LEAST:
         key, value = "algorithm.learning_starts", learner.learning_starts
         why = f"must be at least {LEAST - 1}: a line search needs {LEAST} transitions"
     elif start.initial is not ZERO and chosen.transfers != (warm_start,):

@@ -25,7 +25,7 @@ from bcrl.learning.transfer import (
     StageInit,
     StageResult,
 )
-from bcrl.q.functions import ZERO, Q, add
+from bcrl.q.functions import Q, add
 from bcrl.q.networks.mlp import Adam, DeepQ, Networks, xavier
 
 DRAW_BLOCK = 500  # steps per block; each block has its own random stream
@@ -47,7 +47,7 @@ class DQNState:
     step: int = 0  # steps done in this stage
     residual: Any = None  # (S, A) ϱ at `env_state`, if computed
     searched: Searched | None = None  # of the base; None: not yet, or α is 1
-    #: What `_target` takes of each step so far, until α is searched.
+    #: The arguments of `_target` for each step before the search for α.
     unscaled: list[tuple[Any, ...]] | None = None
 
 
@@ -93,8 +93,7 @@ class DQNTrainer:
         shape = (n, settings.replay_size, env.state_dim, env.n_actions)
         replay, (steps, decisions) = Replay.empty(*shape, device), np.zeros((2, n), int)
         begun = (deep, replay, lanes, env_state, steps, decisions, np.zeros(n))
-        alpha = self.start.boost.alpha
-        if self.start.base is ZERO or alpha == 1.0:
+        if (alpha := self.start.alpha) == 1.0:
             return DQNState(*begun)
         if isinstance(alpha, str):
             return DQNState(*begun, unscaled=[])

@@ -157,8 +157,7 @@ class FQI:
         gamma: float,
     ) -> Searched | None:
         """The scales of S bases, whose values at all points are S arrays (P, A)."""
-        alpha = start.boost.alpha
-        if start.base is ZERO or alpha == 1.0:
+        if (alpha := start.alpha) == 1.0:
             return None
         if not isinstance(alpha, str):
             return Searched.fixed(alpha, len(data))

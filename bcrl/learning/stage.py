@@ -56,7 +56,7 @@ class Stage:
     def alpha(self) -> float | str:
         """The factor of the base, or `search`; 1 without boosting."""
         if (start := tried(self.transfers)) is not None:
-            return start.boost.alpha
+            return start.alpha
         return next((t.alpha for t in self.transfers if isinstance(t, Boost)), 1.0)
 
 

@@ -141,6 +141,11 @@ class StageInit:
             return add(self.base, residual)
         return Shaped(self.base, residual, self.potential)
 
+    @property
+    def alpha(self) -> float | Literal["search"]:
+        """The factor that the learner applies to the base; 1 without a base."""
+        return 1.0 if self.base is ZERO else self.boost.alpha
+
     def rescaled(self, alpha: Floats) -> "StageInit":
         """The same with each seed's base times its entry of `alpha` (S,).
 
