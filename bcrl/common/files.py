@@ -73,6 +73,7 @@ def sha256(data: bytes) -> str:
 
 def sealed(document: dict[str, Any]) -> str:
     """A JSON object as text, with a `digest` over its values."""
+    document = json.loads(json.dumps(document))  # keys become texts, as they are read
     whole = document | {DIGEST: _digest(document)}
     return json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False)
 

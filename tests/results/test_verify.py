@@ -206,3 +206,8 @@ def test_names_that_no_terminal_prints_are_escaped(folder, verified):
     (folder / "seed_\udcff\n.csv").write_text("")
     code, lines = verified()
     assert code == 2 and r"seed_\udcff\n.csv' " in lines[0]
+
+
+def test_numbers_as_keys_are_sealed_as_the_texts_that_they_become():
+    document = {"line_search": {2: "a", 10: "b"}}  # by stage; "10" < "2"
+    assert files.is_intact(json.loads(files.sealed(document)))
