@@ -106,16 +106,17 @@ def _draw_cells(axes: Axes, cells: pd.DataFrame) -> matplotlib.image.AxesImage:
     for y, x in np.ndindex(values.shape):
         text = f"{round(float(values[y, x]))}" if np.isfinite(values[y, x]) else "–"
         dark = values[y, x] < 0.2 * _LIMIT
-        place: dict[str, Any] = {
+        look: dict[str, Any] = {
             "ha": "center",
             "va": "center",
             "fontsize": style.LABEL,
         }
         colour = "white" if dark else "black"
-        axes.text(x, y, text.replace("-", "−"), color=colour, **place)
+        axes.text(x, y, text.replace("-", "−"), color=colour, **look)
     axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
     axes.set_yticks(range(len(names)), names)
     axes.set(xlabel="target", ylabel="source")
-    if not axes.get_subplotspec().is_first_col():  # environments differ in their tasks
+    place: Any = axes.get_subplotspec()
+    if not place.is_first_col():  # environments differ in their tasks
         axes.set(ylabel="", yticklabels=[])
     return image
