@@ -4,7 +4,7 @@ import numpy as np
 
 #: Purposes are numbered for good: a new one is appended, none is renumbered.
 PURPOSES = ("data", "exploration", "replay", "weights", "trees", "evaluation")
-PURPOSES += ("shared_data", "agent")
+PURPOSES += ("shared_data", "agent", "distillation", "inspection")
 
 
 def stream(seed: int, purpose: str, *path: int) -> np.random.Generator:

@@ -17,7 +17,7 @@ from bcrl.learning.fqi import FQI
 from bcrl.learning.line_search import LEAST
 from bcrl.learning.lspi import LSPI
 from bcrl.learning.stage import Learner, Stage
-from bcrl.learning.transfer import SEARCH, Boost, Shape, StageInit, warm_start
+from bcrl.learning.transfer import NEVER, SEARCH, Boost, Shape, StageInit, warm_start
 from bcrl.learning.transitions import LoggedFile, transitions_of
 from bcrl.q.functions import ZERO
 from bcrl.q.quadratic import FEATURES
@@ -100,9 +100,10 @@ def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
             _check_dqn(chosen, learner, start)
         elif isinstance(learner, LSPI):
             _check_slot(chosen, learner, slot, start)
-        elif start.alpha != 1.0:
+        elif (start.alpha, start.boost.fold) != (1.0, NEVER):
+            key = "alpha" if start.alpha != 1.0 else "fold"
             why = f"is for FQI and DQN; {type(learner).__name__} has the base as it is"
-            raise ConfigError("boosting.alpha", start.alpha, why)
+            raise ConfigError(f"boosting.{key}", getattr(start.boost, key), why)
     if chosen.past and start.initial is not ZERO:
         given = chosen.past.learner
         if isinstance(learners[0], DQN) and not isinstance(given, DQN):
@@ -120,7 +121,8 @@ def _check(chosen: Composition, learners: Sequence[Learner]) -> None:
 def _check_fqi(chosen: Composition, learner: FQI, env: Env, start: StageInit) -> None:
     check_numbers("algorithm", vars(learner))
     regressor, why = learner.regressor, ""
-    boost = replace(start.boost, alpha=1.0)
+    loss = Boost.fold_loss  # the factor and folding go with FQI, too
+    boost = replace(start.boost, alpha=1.0, fold="never", fold_loss=loss)
     key, value = "algorithm.regressor", cast(Any, regressor)
     if isinstance(regressor, type) or not hasattr(regressor, "finite_only"):
         why = "is no regressor of ours; Sklearn(estimator) makes one of scikit-learn's"

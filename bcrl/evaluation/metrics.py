@@ -81,7 +81,7 @@ class SeedProbe:
         stage, found = snapshot.stage, snapshot.searched
         place = {"stage": stage.number, "task": stage.task, self.index: snapshot.count}
         rows: list[dict[str, float]] = [place | own for own in self.measure(snapshot)]
-        if stage.alpha != 1.0:
+        if stage.boost.alpha != 1.0:
             found = found or Searched.fixed(np.nan, len(rows))
             for row, *scale in zip(
                 rows, found.alpha.tolist(), found.base_fit.tolist(), strict=True

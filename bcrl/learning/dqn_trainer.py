@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from bcrl.envs import lanes_of
 from bcrl.envs.base import Lanes
 from bcrl.learning import Floats, Integers
 from bcrl.learning.bellman import precompute_target, shaping
+from bcrl.learning.distillation import fold
 from bcrl.learning.line_search import Searched, search
 from bcrl.learning.policies import combined_actions, epsilon_greedy, greedy
 from bcrl.learning.replay import Replay, batched, one_by_one
@@ -25,7 +27,7 @@ from bcrl.learning.transfer import (
     StageInit,
     StageResult,
 )
-from bcrl.q.functions import Q, add
+from bcrl.q.functions import ZERO, Q, add
 from bcrl.q.networks.mlp import Adam, DeepQ, Networks, xavier
 
 DRAW_BLOCK = 500  # steps per block; each block has its own random stream
@@ -249,16 +251,24 @@ class DQNTrainer:
         loss = now.loss / now.updates if now.updates else now.loss + np.nan
         if due:  # a longer run continues from the state at the end
             now.loss, now.updates = np.zeros_like(loss), 0
-        q = self.start.total(now.deep)
-        result = StageResult(q, now.deep, acting=self._acting())
-        measured = (self._evaluated_policy, self.settings.evaluation_episodes, loss)
+        result = StageResult(
+            self.start.total(now.deep), now.deep, acting=self._acting()
+        )
+        policy, folded = partial(self._policy, self.start.base, now.deep), None
+        boost, number = self.stage.boost, self.stage.number
+        ends = now.step == self.settings.length
+        if ends and self.start.base is not ZERO and boost.folds(number):
+            known = result, now.deep, now.replay, boost.fold_loss
+            result, folded = fold(*known, self.batch.seeds, number)
+            policy = partial(self._policy, ZERO, result.q)
+        measured = (policy, self.settings.evaluation_episodes, loss)
         failed |= now.lanes.failures  # each seed has one lane
         searched = now.searched
-        if now.unscaled is not None and now.step == self.settings.length:
+        if now.unscaled is not None and ends:
             searched = Searched.fixed(
                 1.0, len(loss), "alpha stays 1: no update was made"
             )
-        more = {"searched": searched, "failed": failed}
+        more = {"searched": searched, "folded": folded, "failed": failed}
         return StepSnapshot(self.stage, count, now, result, *measured, **more)
 
     def _acting(self) -> Acting:
@@ -272,13 +282,13 @@ class DQNTrainer:
         copying = now.n_greedy_decisions < start.behavior.offset
         return Acting(own, copying, start.prior)
 
-    def _evaluated_policy(self, states: Any, u: Floats, alive: Any) -> Integers:
+    def _policy(self, base: Q, own: Q, states: Any, u: Floats, alive: Any) -> Integers:
         """A `Policy`: half of the lanes explore, the rest is greedy and without PPR."""
         start, settings = self.start, self.settings
         exploring = np.repeat([True, False], settings.evaluation_episodes)
         epsilon = np.where(exploring, settings.evaluation_epsilon, 0.0)
-        residual = self.state.deep(states, self.n_actions)  # (S, E, A)
-        base = prior = start.base(states, self.n_actions)
-        if start.prior is not start.base:
+        residual = own(states, self.n_actions)  # (S, E, A)
+        under = prior = base(states, self.n_actions)
+        if start.prior is not base:
             prior = start.prior(states, self.n_actions)
-        return self._choose(residual, (base, None, prior), u, epsilon, exploring)[1]
+        return self._choose(residual, (under, None, prior), u, epsilon, exploring)[1]

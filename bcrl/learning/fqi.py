@@ -13,6 +13,7 @@ from bcrl.learning import Floats, dataset, rollout
 from bcrl.learning.bellman import residual_target, shaping
 from bcrl.learning.dataset import Dataset
 from bcrl.learning.line_search import Searched, search
+from bcrl.learning.refit import refit
 from bcrl.learning.stage import Pause, SeedBatch, Snapshot, Stage
 from bcrl.learning.transfer import StageInit, StageResult
 from bcrl.learning.transitions import Logged, transitions_of
@@ -72,7 +73,7 @@ class FQI:
     ) -> Iterator[Pause]:
         """Learn a stage, ϱ ← S(T(base + ϱ) − base); yields after each iteration."""
         env, n_actions = stage.env, stage.env.n_actions
-        state = state or self._collect(stage, start, batch)
+        state = state or self.collect(stage, start, batch)
         data, failed = state.data, state.failed
 
         def at_points(q: Q) -> list[Floats]:  # S arrays (P, A)
@@ -136,17 +137,22 @@ class FQI:
             if k % self.evaluate_every and k < self.iterations:
                 yield Pause(stage, count, after)
                 continue
+            ends, folded = k == self.iterations, None
             if is_finite(env):
                 result = StageResult(Table(total, env), Table(residual, env), data)
             else:
                 own = FittedQ([tuple(row) for row in models], self.regressor, batch)
-                last = start if k == self.iterations else cached
+                last = start if ends else cached
                 result = StageResult(last.total(own), own, data)
+            if ends and start.base is not ZERO and stage.boost.folds(stage.number):
+                known = (self.regressor, self.fixed_trees, stage, batch)
+                result, total, folded, lost = refit(*known, result, total, failed)
+                failed = lost | failed
             probed = (
                 [values[d.probe] for values, d in zip(each, data, strict=True)]
                 for each in (total, residual)
             )
-            more = {"searched": searched, "failed": failed}
+            more = {"searched": searched, "folded": folded, "failed": failed}
             yield Iteration(stage, count, after, result, *probed, **more)
 
     def _scales(
@@ -167,7 +173,7 @@ class FQI:
             found.append(search(*known, gamma, d.multiplicity))
         return Searched.of(found)
 
-    def _collect(self, stage: Stage, start: StageInit, batch: SeedBatch) -> FQIState:
+    def collect(self, stage: Stage, start: StageInit, batch: SeedBatch) -> FQIState:
         """The state before the first iteration, with a dataset for each seed."""
         env, previous, n = stage.env, start.previous, len(batch.seeds)
         if self.dataset is not None:

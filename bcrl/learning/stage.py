@@ -9,6 +9,7 @@ from bcrl.common.serialization import storable
 from bcrl.envs import Env
 from bcrl.errors import BcrlError
 from bcrl.learning import Floats
+from bcrl.learning.folding import Folded
 from bcrl.learning.line_search import Searched
 from bcrl.learning.rollout import Policy
 from bcrl.learning.transfer import Boost, StageInit, StageResult, Transfer, begin, tried
@@ -53,11 +54,11 @@ class Stage:
     own_task: int = 0  # its position without the tasks of a source; 0: it is `task`
 
     @cached_property
-    def alpha(self) -> float | str:
-        """The factor of the base, or `search`; 1 without boosting."""
+    def boost(self) -> Boost:
+        """How it uses its base, as far as its transfers tell."""
         if (start := tried(self.transfers)) is not None:
-            return start.alpha
-        return next((t.alpha for t in self.transfers if isinstance(t, Boost)), 1.0)
+            return Boost() if start.base is ZERO else start.boost
+        return next((t for t in self.transfers if isinstance(t, Boost)), Boost())
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,7 @@ class Snapshot(Pause):
 
     result: StageResult
     searched: Searched | None = field(default=None, kw_only=True)  # of the base
+    folded: Folded | None = field(default=None, kw_only=True)  # how `result` changed
     #: Seeds that cannot continue, by index in the batch, and why.
     failed: dict[int, str] = field(default_factory=dict, kw_only=True)
 

@@ -7,7 +7,7 @@ can be combined: `Boost` and `Shape` make SBC-DQN.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any, Literal
 
 import numpy as np
@@ -20,6 +20,7 @@ from bcrl.learning import Floats
 from bcrl.q.functions import ZERO, Q, Shaped, Sum, add, memoized, scaled
 
 SEARCH = "search"  # a value of `Boost.alpha`
+NEVER, ALWAYS = "never", "always"  # values of `Boost.fold`
 
 
 @storable
@@ -44,6 +45,11 @@ class StageResult:
     acting: Acting | None = None  # None: the policy is greedy on `q`
 
 
+def _is(kind: type, value: Any) -> bool:
+    """Whether a value is a number of a kind; true and false are none."""
+    return isinstance(value, kind) and not isinstance(value, bool)
+
+
 @dataclass(frozen=True)
 class Boost:
     """The previous Q is frozen as the base of a new residual (B-; paper, Eq. 5).
@@ -53,20 +59,40 @@ class Boost:
     max ϱ + max base. `mask_at_goal`: the base does not count in absorbing next states.
     The defaults are the paper's; the released BC-DQN has residual, two and false.
     `alpha`: a factor ≥ 0 of the base, or `search` for one that suits each seed's data
-    (`line_search`; not in the paper). Raises ConfigError for another.
+    (`line_search`; not in the paper).
+    `fold`: whether Q becomes one approximator at the end of a stage (`folding`; not in
+    the paper): `never`, `always`, or after every so many stages, counted from the
+    second. `fold_loss`: the error that a network may have then, as a share of the
+    spreads of V and of the advantages. Raises ConfigError for other values.
     """
 
     greedy_on: Literal["sum", "residual"] = "sum"
     maxima: Literal["one", "two"] = "one"
     mask_at_goal: bool = True
     alpha: float | Literal["search"] = 1.0
+    fold: int | Literal["never", "always"] = "never"
+    fold_loss: float = 0.03
 
     def __post_init__(self) -> None:
         alpha: Any = self.alpha
-        number = isinstance(alpha, Real) and not isinstance(alpha, bool)
-        if alpha != SEARCH and not (number and 0.0 <= alpha < math.inf):
+        fold: Any = self.fold
+        loss = self.fold_loss
+        if alpha != SEARCH and not (_is(Real, alpha) and 0.0 <= alpha < math.inf):
             why = "must be a number of at least 0, or search"
             raise ConfigError("boosting.alpha", alpha, why)
+        if fold not in (NEVER, ALWAYS) and not (_is(Integral, fold) and fold >= 1):
+            why = "must be never, always, or a whole number of stages of at least 1"
+            raise ConfigError("boosting.fold", fold, why)
+        if not (_is(Real, loss) and 0.0 < loss < math.inf):
+            raise ConfigError("boosting.fold_loss", loss, "must be a number above 0")
+        if fold != NEVER and self.greedy_on != "sum":
+            why = "folds the sum, but the agent acts on the residual alone: fold=never"
+            raise ConfigError("boosting.fold", fold, why)
+
+    def folds(self, stage: int) -> bool:
+        """Whether Q is folded at the end of a stage, counted from 1."""
+        every: Any = 1 if self.fold == ALWAYS else self.fold
+        return every != NEVER and stage > 1 and (stage - 1) % every == 0
 
     def __call__(self, start: "StageInit", previous: StageResult) -> "StageInit":
         return replace(start, base=previous.q, boost=self)

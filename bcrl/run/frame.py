@@ -119,7 +119,7 @@ def about(stages: Sequence[Stage]) -> tuple[str, dict[str, Any]]:
     last = stages[-1]
     target_only = all(stage.env == last.env for stage in stages)
     name = getattr(last.learner, "name", type(last.learner).__name__)
-    method, alpha = method_name(name, last.transfers, target_only), last.alpha
+    method, alpha = method_name(name, last.transfers, target_only), last.boost.alpha
     if alpha != 1.0:
         method += "@line_search" if alpha == SEARCH else f"@alpha={alpha}"
     return method, _settings(last.learner)

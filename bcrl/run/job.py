@@ -99,8 +99,8 @@ class _Training:
         self.rows: list[list[dict[str, Any]]] = [[] for _ in seeds]  # of the CSVs
         self.residuals: list[Q] = []  # ϱ of the stages that an agent keeps
         self.failed: dict[int, str] = {}  # by place in the batch
-        #: By stage and place: why the scale of the base could not be searched.
-        self.notes: dict[int, dict[int, str]] = {}
+        #: By name, stage and place: why α was not searched, how folding changed Q.
+        self.notes: dict[tuple[str, int, int], Any] = {}
         self.interruptions = 0
         self._began = _clocks()  # minus what was spent before an interruption
         self._path = checkpoints.checkpoint_path(plan, seeds)
@@ -160,10 +160,19 @@ class _Training:
         for place, why in self.probe.failed.items():
             self.failed.setdefault(place, f"{why} at {index} {snapshot.count}")
         if snapshot.last_of_stage:
+            number, folded = snapshot.stage.number, snapshot.folded
+            own = snapshot.result.residual
             if snapshot.searched is not None:
-                self.notes[snapshot.stage.number] = snapshot.searched.reasons
+                for place, why in snapshot.searched.reasons.items():
+                    self.notes["line_search", number, place] = why
+            if folded is not None:
+                for place in range(len(self.seeds)):
+                    self.notes["fold", number, place] = folded.facts(place)
+            whole = self.plan.config["keep"] in _ALL
+            own = folded.residual if folded is not None and whole else own
             earlier = self.residuals if self._keeps_all else []
-            self.residuals = [*earlier, snapshot.result.residual]
+            # What is folded takes the place of all residuals.
+            self.residuals = [*(earlier if folded is None or whole else ()), own]
 
     def _save(self) -> None:
         self._check_locks()
@@ -206,8 +215,9 @@ class _Training:
                 failed[seed], status = why, f"failed: {why}"
                 say(f"{plan.env} {plan.name}: seed {seed} {status}")
             agent, own = self._agent(place) if seed not in failed else (None, {})
-            notes = {n: own[place] for n, own in self.notes.items() if place in own}
-            own |= {"line_search": notes} if notes else {}
+            for (name, stage, of), note in self.notes.items():
+                if of == place:
+                    own[name] = own.get(name, {}) | {stage: note}
             found = self.rows[place], arrays[place], facts | own, agent
             self._check_locks()
             records.write_seed(plan, seed, status, *found)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from bcrl.envs import is_finite
 from bcrl.errors import ConfigError
+from bcrl.learning.transfer import ALWAYS, NEVER
 from bcrl.run.schedule import Job
 
 GIB = 2**30
@@ -21,7 +22,8 @@ def needed(job: Job) -> dict[str, int]:
     Forests are estimated from above (episodes of full length); the rest is allocated.
     """
     found, plan = dict[str, int](), job.plan
-    boosts = plan.config["boosting"]["name"] != "off"
+    boosting = plan.config["boosting"]
+    boosts, fold = boosting["name"] != "off", boosting.get("fold", NEVER)
     for stage in plan.stages:
         env, learner = stage.env, vars(stage.learner)
         d, finite = env.state_dim, is_finite(env)
@@ -30,7 +32,10 @@ def needed(job: Job) -> dict[str, int]:
         row = 4 * (2 * d + env.n_actions + 4) + 1  # of learning/replay.py
         episodes, held = learner.get("episodes", 0), learner.get("replay_size", 0)
         trees = 0 if finite else getattr(learner.get("regressor"), "trees", 0)
-        forests = len(plan.stages) if boosts else 1  # that are kept
+        n = len(plan.stages)
+        forests = (
+            min(n, {NEVER: n, ALWAYS: 2}.get(fold, fold)) if boosts else 1
+        )  # that are kept
         evaluated = 2 * episode * learner.get("evaluation_episodes", 0)
         sizes = {"episodes": episode * episodes, "evaluation_episodes": evaluated}
         sizes["replay_size"] = row * min(held, stage.learner.length)

@@ -240,7 +240,7 @@ def test_a_wrapped_boost_is_known_by_what_it_does():
         return SEARCH(start, previous)
 
     course = stages([Corridor(), Corridor(2.0)], FQI(1, regressor=Tabular()), own)
-    assert [stage.alpha for stage in course] == ["search", "search"]
+    assert [stage.boost.alpha for stage in course] == ["search", "search"]
 
 
 # --- DQN ---

@@ -50,6 +50,14 @@ KINDS |= {
     "the same data": (*HILL, "variant=B", "algorithm.dataset=shared"),
 }
 KINDS["the same data"] += ("algorithm.new_data=task",)
+KINDS |= {
+    "folded tables": (*MAZE, "boosting.fold=2"),
+    "folded forests": (*SHORT, "variant=BC", "boosting.fold=always"),
+    "folded networks": (*DQN, "variant=SBC", "boosting.fold=always"),
+    "folded lines": (*SHORT, "variant=BC", "algorithm/regressor=sklearn"),
+}
+KINDS["folded networks"] += ("boosting.fold_loss=2",)
+KINDS["folded lines"] += ("algorithm.regressor.estimator=Ridge", "boosting.fold=1")
 KINDS["sklearn's forest"] += ("algorithm.regressor.trees=3",)
 
 
