@@ -44,6 +44,7 @@ class CarOnHill:
     gamma: float = 0.95
     horizon: int = 100
 
+    components = ("position p, m", "speed v, m/s")  # of the state
     name, n_actions, state_dim = "car_on_hill", 2, 2
     initial_noise, step_noise = 0, 0
     actions = np.array([[-FORCE], [FORCE]])

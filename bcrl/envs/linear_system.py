@@ -55,6 +55,7 @@ class LinearSystem:
     preset: str = "released"
 
     name, n_actions, state_dim = "linear_system", 8, 4
+    components = ("x", "ẋ", "y", "ẏ")  # of the state
     initial_noise, step_noise = 4, 8  # four for the derivative, four for a fresh start
     actions, positions = ACTIONS, (0, 2)
 

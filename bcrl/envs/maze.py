@@ -55,6 +55,7 @@ class Maze:
     preset: str = "lattice"
 
     name, n_actions, state_dim = "maze", 4, 2
+    components = ("x", "y")  # of the state
     initial_noise, step_noise = 0, 0
     actions, goal = MOVES, GOAL
     bounds = np.array([[0.0, 0.0], [1.0, 1.0]])  # of the states

@@ -4,7 +4,7 @@ import inspect
 import sys
 from argparse import Namespace
 from collections import defaultdict
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -21,8 +21,9 @@ from bcrl.report.figures import curves, linear, maze, style
 from bcrl.report.figures.layout import Print, formats, inches, save_figure
 from bcrl.report.load import load_runs
 from bcrl.report.page import page
-from bcrl.report.variants import COMPARED, LINEAR, Pair, Runs, env_title
+from bcrl.report.variants import COMPARED, LINEAR, Pair, Runs, Variant, env_title
 from bcrl.results.arguments import ResultsParser
+from bcrl.results.layout import INSPECTED, INSPECTION
 
 CAR, MAZE, LQ = ("car_on_hill", "FQI"), ("maze", "FQI"), (LINEAR, "DQN")
 #: figure → its runs' environment and family, experiment, method it cannot do without
@@ -146,8 +147,21 @@ def report(
         for variant in runs.variants
         if tag in (None, variant.tag) and (path := gif_of(runs, variant, out)).exists()
     ]
-    write(f"report_{suffix}.html", page(runs, tag, drawn, agents, claims, sweeps))
+    found = inspected(v for v in runs.variants if tag in (None, v.tag))
+    write(
+        f"report_{suffix}.html", page(runs, tag, drawn, agents, claims, sweeps, found)
+    )
     return files, skipped
+
+
+def inspected(variants: Iterable[Variant]) -> list[tuple[Path, str]]:
+    """The figures that `bcrl-inspect` has left in the variants' folders."""
+    return [
+        (path, f"{env_title(variant.env)}: {variant.name}, {words}")
+        for variant in variants
+        for name, words in INSPECTED.items()
+        if (path := variant.folder / INSPECTION / f"{name}.png").exists()
+    ]
 
 
 def _draw_chosen(options: Namespace, how: Print) -> int:

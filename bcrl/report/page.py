@@ -41,13 +41,15 @@ def page(
     agents: Sequence[Picture],
     claims: Mapping[Pair, Section],
     sweeps: Sequence[Section],
+    inspections: Sequence[Picture] = (),
 ) -> str:
     """The page of one scale's runs. `figures` that the paper doesn't have are for
-    browsers that run no scripts; `agents` move."""
+    browsers that run no scripts; `agents` move; `inspections` are of residuals."""
     notes = runs.notes_on(tag)
     given = {"version": __version__, "texts": PARAGRAPHS, "runs": runs, "tag": tag}
     given |= {"glossary": GLOSSARY, "about_tasks": TASKS}
     given |= {"figures": figures, "claims": claims, "agents": agents, "sweeps": sweeps}
+    given |= {"inspections": inspections}
     given |= {"notes": notes, "incomplete": incomplete(notes)}
     return _JINJA.get_template("page.html").render(
         given,

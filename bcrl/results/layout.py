@@ -16,6 +16,13 @@ SCHEMA = 2  # of a seed's files; raised when their meaning changes
 CONFIG = "config.yaml"
 SUFFIXES = ("json", "csv", "npz")
 AGENT = "agent"  # the suffix of a file that may be removed
+INSPECTION = "inspection"  # a folder in a variant's, of what bcrl-inspect has found
+#: Its figures, and what they show.
+INSPECTED = {
+    "stages": "each residual: its size, what it decides, errors of Q",
+    "ablations": "the target task without one residual, and with the first ones only",
+    "maps": "what each residual adds to V(s) = max_a Q(s, a)",
+}
 SEED, CHECKPOINT, STATE = "seed_", "checkpoint_", "state_"  # what names begin with
 LOGS = ".tensorboard"  # in runs_dir; hidden, because it holds no results
 

@@ -24,13 +24,20 @@ def load(run: str | Path, seed: int = 0, *, trust: str | Iterable[str] = ()) -> 
     trust: your packages that the run's config names, and that may be imported.
     Raises BcrlError if there is no such agent, or its file is not what the run wrote.
     """
+    return loaded_with_plan(run, seed, trust)[0]
+
+
+def loaded_with_plan(
+    run: str | Path, seed: int, trust: str | Iterable[str] = ()
+) -> tuple[Agent, Plan]:
+    """What `load` returns, and the plan of the run."""
     folder = Path(os.path.abspath(run))  # links stay
     document = document_of(folder, seed)
     made = _plan(folder, document, [trust] if isinstance(trust, str) else trust)
     batch = SeedBatch((seed,), np.empty((0, made.target.state_dim)), cores())
     learned = read_agent(folder, seed, document, made, batch)
     check_recorded(learned.result.q, made.target, folder, {seed: document})
-    return Agent(made.target, document["config"], seed, learned)
+    return Agent(made.target, document["config"], seed, learned), made
 
 
 def _plan(folder: Path, document: dict[str, Any], trust: Iterable[str]) -> Plan:

@@ -1,0 +1,1 @@
+"""Looking into a boosted Q-function: what each residual is worth, and where."""
