@@ -29,6 +29,7 @@ from bcrl.learning.transfer import (
 )
 from bcrl.q.functions import ZERO, Q, add
 from bcrl.q.networks.mlp import Adam, DeepQ, Networks, xavier
+from bcrl.q.networks.units import InUnits
 
 DRAW_BLOCK = 500  # steps per block; each block has its own random stream
 
@@ -83,8 +84,11 @@ class DQNTrainer:
         noise = np.stack([rng.random(env.initial_noise) for rng in rngs])
         lanes = lanes_of(env)
         env_state = lanes.begin(env.initial(noise))
-        if isinstance(self.start.initial, DeepQ):
-            deep = copy.deepcopy(self.start.initial)
+        initial = self.start.initial
+        if isinstance(initial, InUnits):  # what was folded
+            deep = initial.absorbed()
+        elif isinstance(initial, DeepQ):
+            deep = copy.deepcopy(initial)
         else:
             sizes = (env.state_dim, *settings.hidden, env.n_actions)
             drawn = [xavier(stream(s, "weights", number), sizes) for s in seeds]

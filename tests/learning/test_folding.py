@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+import torch
 from sklearn.linear_model import Lasso, LinearRegression, PoissonRegressor, Ridge
 
 from bcrl.api import Boost, stages
 from bcrl.envs.linear_system import LinearSystem
 from bcrl.envs.maze import Maze
 from bcrl.errors import ConfigError
-from bcrl.learning.distillation import distilled
+from bcrl.learning.distillation import distilled, units_of
 from bcrl.learning.dqn import DQN
 from bcrl.learning.folding import Folded
 from bcrl.learning.fqi import FQI
@@ -16,7 +17,8 @@ from bcrl.learning.stage import SeedBatch, learn
 from bcrl.q.functions import Sum, Table
 from bcrl.q.linear import Linear
 from bcrl.q.networks.cpu import outputs
-from bcrl.q.networks.mlp import DeepQ
+from bcrl.q.networks.mlp import Adam, DeepQ, Networks, xavier
+from bcrl.q.networks.units import InUnits
 from bcrl.q.regressors.base import FittedQ
 from bcrl.q.regressors.ours import ForestRegressor, Tabular
 from bcrl.q.regressors.scikit import Sklearn
@@ -159,16 +161,29 @@ def sums(n=2000, seed=0):
 
 def test_distillation_keeps_its_loss_and_returns_a_network_of_plain_states():
     x, y = sums()
-    found = distilled((2, 64, 64, 3), x, y, 0.05, seed=3, stage=2)
+    rows = np.stack([xavier(np.random.default_rng(0), SIZES)] * 2)
+    online = Networks(SIZES, torch.from_numpy(rows))
+    units = units_of(DeepQ(online, online, Adam.of(online.flat, 1e-4)), [y - 1.0, y])
+    found = distilled(units, 1, x, y, 0.05, seed=3, stage=2)
     assert found.error <= 0.05
-    again = outputs(found.flat[None], np.array([2, 64, 64, 3]), np.float32(x)[None])[0]
-    assert np.array_equal(again, found.values)
-    v, now = y.mean(1), again.mean(1, dtype=float)
-    parts = (now - v) / v.std(), ((again - y).T - (now - v)) / (y.T - v).std()
+    z = outputs(found.flat[None], np.array(SIZES), np.float32(x)[None])[0].astype(float)
+    assert np.array_equal(units.plain(1, z), found.values)
+    v, now = y.mean(1), found.values.mean(1)
+    parts = (now - v) / v.std(), ((found.values - y).T - (now - v)) / (y.T - v).std()
     error = np.sqrt(np.mean((parts[0] + parts[1]) ** 2))  # of V, of the advantages
-    assert error == pytest.approx(found.error, rel=1e-3)
+    assert error == pytest.approx(found.error, rel=1e-6)
+    assert np.allclose(units.plain(1, units.in_units(1, y)), y)
 
 
+def test_what_was_folded_can_be_trained_further():
+    boost = Boost(fold="always", fold_loss=0.5)
+    q = ends(boost, TASKS[:2], SMALL)[-1].result.q
+    states = np.random.default_rng(1).normal(size=(2, 9, 4))
+    whole, own = np.array(q(states, 8)), np.array(q.absorbed()(states, 8))
+    assert isinstance(q, InUnits) and np.allclose(whole, own, rtol=1e-4, atol=1e-3)
+
+
+SIZES = (2, 64, 64, 3)
 SMALL = DQN(120, 0, learning_starts=20, hidden=(16,), evaluation_episodes=2)
 TASKS = [LinearSystem(drift=d) for d in (0.0, -0.25, -0.5)]
 
@@ -177,7 +192,7 @@ def test_dqns_folded_sum_is_one_network_that_acts_and_is_the_next_base():
     boost = Boost(fold="always", fold_loss=0.5)
     made = ends(boost, TASKS, SMALL)
     for now in made[1:]:
-        assert isinstance(now.result.q, DeepQ)
+        assert isinstance(now.result.q, InUnits)
         assert now.result.acting.own is now.result.q is now.result.residual
         assert now.folded.facts(0)["mean_change"] > 0 and not any(now.folded.notes)
         states = np.random.default_rng(1).normal(size=(2, 2 * 2, 4))
@@ -186,7 +201,8 @@ def test_dqns_folded_sum_is_one_network_that_acts_and_is_the_next_base():
         assert np.array_equal(now.policy(states, u, None)[:, 2:], best[:, 2:])
     alone = ends(boost, TASKS, SMALL, seeds=(1,))
     for a, b in zip(made, alone, strict=True):
-        assert np.array_equal(a.result.q.online.flat[1], b.result.q.online.flat[0])
+        one, other = (getattr(x.result.q, "deep", x.result.q) for x in (a, b))
+        assert np.array_equal(one.online.flat[1], other.online.flat[0])
 
 
 def test_a_loss_out_of_reach_is_told():
