@@ -1,7 +1,7 @@
 """The paper's error bounds as functions of measured numbers (section 5, appendix B).
 
 In one task: Q^k, k = 0 … K, are the Q-functions of value iteration with a regressor S,
-ϱ^k = T Q^(k-1) − Q^0 what S is asked for, ε^k = ϱ^k − S ϱ^k its error. Norms are one
+ϱ^k = T Q^(k-1) − Q^0 the target of S, ε^k = ϱ^k − S ϱ^k its error. Norms are one
 number per iteration.
 """
 

@@ -41,10 +41,15 @@ class Key(NamedTuple):
     alpha: float | str
 
 
+def frequency_of(variant: Variant) -> int:
+    """F, the steps between two copies to the target network, in the target task."""
+    every = variant.config["algorithm"]["target_update"]
+    return int(every[-1] if isinstance(every, list) else every)
+
+
 def key_of(variant: Variant) -> Key:
     """What tells the runs apart."""
-    every = variant.config["algorithm"]["target_update"]
-    frequency = every[-1] if isinstance(every, list) else every
+    frequency = frequency_of(variant)
     return Key(variant.method, frequency, variant.config["boosting"].get("alpha", 1.0))
 
 

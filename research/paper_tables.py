@@ -17,9 +17,10 @@ from bcrl.report import tables
 from bcrl.report.claims import claims_sections
 from bcrl.report.load import load_runs
 from bcrl.report.tables import Section, TextTable
-from bcrl.report.variants import LINEAR, Runs, Variant
+from bcrl.report.variants import COMPARED, LINEAR, Runs, Variant
 from bcrl.results.layout import spelled
 from bcrl.results.statistics import bootstrap
+from research.line_search import frequency_of
 
 HEAD = """# Tables of all results
 
@@ -38,7 +39,6 @@ constants of the paper's text.
 SEARCHES = """`make searches` runs other seeds than all results: {seeds}. Late returns;
 there is no interval where all seeds never arrived. The searches over F:
 """
-NAMES = ("DQN", "C-DQN", "BC-DQN", "SC-DQN", "SBC-DQN", "RPL", "PPR")
 
 
 class Key(NamedTuple):
@@ -51,14 +51,13 @@ class Key(NamedTuple):
 
 
 def key_of(variant: Variant) -> Key | None:
-    """The key of a run; None of a line search, which has a page of its own."""
+    """The key of a run; None of a line search, which another page is about."""
     config = variant.config
     if config["boosting"].get("alpha", 1.0) != 1.0:
         return None
     released = config["boosting"].get("greedy_on") == "residual"
     released |= config["transfer"].get("zero_at_goal") is False
-    every = config["algorithm"]["target_update"]
-    frequency = every[-1] if isinstance(every, list) else every
+    frequency = frequency_of(variant)
     reading = "released" if released else "paper"
     return Key(variant.method, reading, frequency, config["env"]["preset"])
 
@@ -98,7 +97,7 @@ def readings(found: dict[Key, Variant]) -> Iterator[dict[str, str]]:
 
 def constants(found: dict[Key, Variant]) -> Iterator[dict[str, str]]:
     """Both presets of the constants."""
-    for method in NAMES:
+    for method in COMPARED[LINEAR, "DQN"]:
         of = [
             next((v for k, v in found.items() if _published(k, v, method, x)), None)
             for x in ("released", "paper")

@@ -93,7 +93,7 @@ class Task:
             self.errors[name], self.residuals[name], self.steps[name] = [], [], []
 
     def add(self, q: Q) -> None:
-        """Measure the iteration that led to `q`."""
+        """Measure the iteration that ends with `q`."""
         target, now = self.model.bellman(self.before), self.model.q(q)
         for name, norm in NORMS.items():
             self.errors[name].append(norm(target - now))

@@ -16,7 +16,8 @@ from bcrl.envs import Env
 from bcrl.errors import BcrlError
 from bcrl.inspection.measures import Inspection
 from bcrl.inspection.stack import stack
-from bcrl.results.layout import AGENT, INSPECTION, recorded_seeds
+from bcrl.results.layout import INSPECTION
+from bcrl.run.agents import seeds_with_agents
 
 _ABOUT = """Look into a boosted Q-function, Q_t = α Q_(t-1) + ϱ_t: how large each
 residual ϱ_t is, which greedy actions it changes, what happens without it, and where it
@@ -41,10 +42,7 @@ def _inspect(asked: argparse.Namespace) -> None:
     from bcrl.report.figures import layout, style
 
     how = layout.Print(layout.inches(asked.width), layout.formats(asked.format))
-    seeds = sorted({*asked.seed}) or recorded_seeds(asked.run, AGENT)
-    if not seeds:
-        why = "has no agents; name a folder that a run with keep=final has made"
-        raise BcrlError(f"{asked.run} {why}")
+    seeds = seeds_with_agents(asked.run, asked.seed)
     if asked.episodes < 1:
         raise BcrlError(f"--episodes {asked.episodes}: must be at least 1")
     out = asked.out or asked.run / INSPECTION

@@ -17,10 +17,16 @@ from bcrl.common.seeding import stream
 from bcrl.envs import Env, is_simulated
 from bcrl.evaluation import oracle
 from bcrl.inspection.stack import Stack
-from bcrl.learning import Booleans, Floats, Integers
+from bcrl.learning import Booleans, Floats, dataset
 from bcrl.learning.dataset import Dataset
 from bcrl.learning.fqi import FQI
-from bcrl.learning.rollout import draws, rollout, starts_and_draws, success_of
+from bcrl.learning.rollout import (
+    Episodes,
+    draws,
+    rollout,
+    starts_and_draws,
+    success_of,
+)
 from bcrl.learning.stage import SeedBatch, Stage
 from bcrl.learning.transfer import StageInit, StageResult
 from bcrl.q.functions import Q
@@ -30,22 +36,9 @@ PLAYED = 20  # episodes that stand for the data of learners that keep none
 WHOLE, WITHOUT, UPTO = "whole", "without", "upto"
 
 
-@dataclass(frozen=True)
-class Visits:
-    """The transitions of a stage's data."""
-
-    points: Floats  # (P, d) distinct states
-    state: Integers  # (n,) rows of `points`
-    action: Integers  # (n,)
-    reward: Floats  # (n,)
-    next_state: Integers  # (n,) rows of `points`
-    absorbing: Booleans  # (n,)
-    counts: Integers  # (n,) how often each occurs
-
-
 def values(q: Q, states: Floats, n_actions: int) -> Floats:
     """Values (n, A) of one seed's Q-function at states (n, d)."""
-    return np.asarray(q(states[None], n_actions))[0]
+    return np.asarray(q(states[None].astype(np.float64), n_actions))[0]
 
 
 @dataclass
@@ -56,46 +49,36 @@ class Inspection:
     episodes: int = 50  # of each ablation, where episodes start at random
 
     @cached_property
-    def visits(self) -> list[Visits]:
+    def visits(self) -> list[Dataset]:
         """The data of each stage."""
-        batch = SeedBatch(
-            (self.stack.agent.seed,), np.empty((0, self._target.state_dim))
-        )
+        nothing = np.empty((0, self._target.state_dim))
+        batch = SeedBatch((self.stack.agent.seed,), nothing)
         found, before, data = [], None, None
         for stage in self.stack.stages:
             learner, now = stage.learner, self.stack.upto(stage.number)
             if isinstance(learner, FQI):
                 past = None if before is None else StageResult(before, before, data)
                 data = learner.collect(stage, StageInit(past), batch).data
-                found.append(_of_dataset(data[0]))
+                found.append(data[0])
             else:
-                found.append(self._played(stage, now))
+                played = self._played(stage, now)
+                found.append(dataset.build(stage.env, played, 0, nothing))
             before = now
         return found
 
-    def _played(self, stage: Stage, q: Q) -> Visits:
+    def _played(self, stage: Stage, q: Q) -> Episodes:
         """Episodes of the agent as it was at a stage's end, exploring as it did."""
-        env, learner = stage.env, stage.learner
         rngs = [stream(self.stack.agent.seed, "inspection", stage.number)]
-        start, u = starts_and_draws(rngs, env, PLAYED)
-        epsilon = getattr(learner, "evaluation_epsilon", 0.0)
-        played = rollout(env, q, start, u, epsilon)
-        seen = np.arange(played.reward.shape[-1]) < played.length[0][:, None]
-        before, after = played.state[0, :, :-1][seen], played.state[0, :, 1:][seen]
-        points, place = np.unique(
-            np.concatenate([before, after]), axis=0, return_inverse=True
+        epsilon = getattr(stage.learner, "evaluation_epsilon", 0.0)
+        return rollout(
+            stage.env, q, *starts_and_draws(rngs, stage.env, PLAYED), epsilon
         )
-        state, next_state = np.split(place.reshape(-1), 2)
-        known = (x[0][seen] for x in (played.action, played.reward, played.absorbing))
-        action, reward, absorbing = known
-        once = np.ones(len(state), np.int64)
-        return Visits(points, state, action, reward, next_state, absorbing, once)
 
     def stages(self) -> pd.DataFrame:
         """A row per stage: sizes of ϱ, what it decides, and errors of Q."""
         return pd.DataFrame(map(self._stage, self.stack.stages, self.visits))
 
-    def _stage(self, stage: Stage, seen: Visits) -> dict[str, Any]:
+    def _stage(self, stage: Stage, seen: Dataset) -> dict[str, Any]:
         env, stack, n = stage.env, self.stack, stage.number
         q = stack.upto(n)
         base = stack.base(n, stack.upto(n - 1))
@@ -103,7 +86,7 @@ class Inspection:
             values(each, seen.points, env.n_actions)
             for each in (stack.residuals[n - 1], base, q)
         )
-        at, w = (seen.state, seen.action), seen.counts / seen.counts.sum()
+        at, w = (seen.state, seen.action), seen.multiplicity / seen.multiplicity.sum()
         changed = (
             _new_choice(under, whole)[seen.state] if n > 1 else np.full(len(w), np.nan)
         )
@@ -131,7 +114,8 @@ class Inspection:
         asked += [(UPTO, t, self.stack.upto(t)) for t in range(1, n)]
         seen = self.visits[-1]
         whole = values(asked[0][2], seen.points, self._target.n_actions)
-        w = np.bincount(seen.state, seen.counts, len(seen.points)) / seen.counts.sum()
+        w = np.bincount(seen.state, seen.multiplicity, len(seen.points))
+        w /= w.sum()
         rows = []
         for kind, stage, q in asked:
             now = values(q, seen.points, self._target.n_actions)
@@ -183,8 +167,3 @@ def _new_choice(before: Floats, after: Floats) -> Booleans:
     """Whether the greedy action after, (n, A), was not greedy before: (n,)."""
     chosen = after.argmax(-1)
     return before[np.arange(len(before)), chosen] < before.max(-1)
-
-
-def _of_dataset(data: Dataset) -> Visits:
-    rows = (data.state, data.action, data.reward, data.next_state, data.absorbing)
-    return Visits(np.asarray(data.points, np.float64), *rows, data.multiplicity)

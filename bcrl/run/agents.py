@@ -13,8 +13,16 @@ from bcrl.config.plan import Plan, recorded, unusable_config
 from bcrl.errors import BcrlError, ConfigError
 from bcrl.learning.agent import Agent
 from bcrl.learning.stage import SeedBatch
+from bcrl.results.layout import AGENT, recorded_seeds
 from bcrl.run.agent_files import check_recorded, document_of, read_agent
 from bcrl.run.workers import cores
+
+
+def seeds_with_agents(run: Path, chosen: Iterable[int]) -> list[int]:
+    """The chosen seeds, or all that have an agent; BcrlError if there are none."""
+    if seeds := sorted({*chosen}) or recorded_seeds(run, AGENT):
+        return seeds
+    raise BcrlError(f"{run} has no agents; name a folder that a run has made")
 
 
 def load(run: str | Path, seed: int = 0, *, trust: str | Iterable[str] = ()) -> Agent:

@@ -23,8 +23,7 @@ from bcrl.learning.agent import Agent
 from bcrl.learning.logged_files import check_target
 from bcrl.learning.rollout import CHOICES, Episodes, play, starts_and_draws, success_of
 from bcrl.learning.transitions import Transitions
-from bcrl.results.layout import AGENT, recorded_seeds
-from bcrl.run.agents import load
+from bcrl.run.agents import load, seeds_with_agents
 
 _ABOUT = """Play greedy episodes with the agents of a run, write one row per episode to
 a CSV and print the returns. Words such as env.mass=1.4 change the task; those of a
@@ -142,11 +141,8 @@ def _evaluate(asked: argparse.Namespace) -> None:
         raise BcrlError(f"--episodes {asked.episodes}: must be at least 1")
     if asked.record:
         check_target(asked.record)
-    seeds = sorted({*asked.seed}) or recorded_seeds(asked.run, AGENT)
-    if not seeds:
-        raise BcrlError(f"{asked.run} has no agents; name a folder that a run has made")
     found, logged = [], []
-    for seed in seeds:
+    for seed in seeds_with_agents(asked.run, asked.seed):
         agent = load(asked.run, seed, trust=asked.trust)
         env = _task(agent, asked.task, asked.overrides)
         played = episodes(agent, env, asked.episodes)

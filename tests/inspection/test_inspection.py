@@ -84,7 +84,7 @@ def test_the_data_are_the_runs_own(inspected):
     """FQI's last fit had these rows."""
     _, own = inspected
     for seen, q in zip(own.visits, own.stack.residuals, strict=True):
-        assert seen.counts.sum() > 0 and len(seen.points) > 1
+        assert seen.multiplicity.sum() > 0 and len(seen.points) > 1
         for a, fitted in enumerate(getattr(q, "models", [[]])[0]):
             rows = seen.points[seen.state[seen.action == a]]
             assert np.array_equal(fitted.problem.x, np.float32(rows))

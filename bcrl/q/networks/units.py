@@ -18,7 +18,7 @@ from bcrl.q.networks.mlp import Adam, DeepQ, Networks
 class InUnits:
     """Q = m + σ_V z̄ + σ_A (z − z̄): z are a network's outputs, z̄ is their mean.
 
-    V is far larger than the differences between actions. In units of their own these
+    V is far larger than the differences between actions. With separate units, these
     keep the precision of the network's floats.
     """
 
